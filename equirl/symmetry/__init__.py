@@ -1,0 +1,18 @@
+"""The symmetry, stated once: groups, representations, and how every key transforms."""
+
+from .groups import Element, SymmetryGroup
+from .representations import Irrep, Representation, ScalarField
+from .spec import ACTION, ACTION_PAPER, SymmetrySpec, action_representation, manipulation_spec
+
+__all__ = [
+    "ACTION",
+    "ACTION_PAPER",
+    "Element",
+    "Irrep",
+    "Representation",
+    "ScalarField",
+    "SymmetryGroup",
+    "SymmetrySpec",
+    "action_representation",
+    "manipulation_spec",
+]

@@ -1,0 +1,89 @@
+"""The one statement of the symmetry: how every tensordict key transforms."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from .groups import Element
+from .representations import Representation, ScalarField
+
+__all__ = ["ACTION", "ACTION_PAPER", "SymmetrySpec", "action_representation", "manipulation_spec"]
+
+#: The action (gripper, x, y, z, theta): a reflection reverses the sense of theta.
+ACTION = Representation("trivial", "vector", "trivial", "sign")
+#: The action as the paper's networks declare it (appendix A): theta an invariant.
+ACTION_PAPER = Representation("trivial", "vector", "trivial", "trivial")
+
+
+def action_representation(mode: str) -> Representation:
+    """The action's representation in the networks of a mode.
+
+    Args:
+        mode: ``"strict"`` (the physical action) or ``"paper"`` (appendix A).
+
+    Raises:
+        ValueError: Any other mode.
+    """
+    try:
+        return {"strict": ACTION, "paper": ACTION_PAPER}[mode]
+    except KeyError:
+        raise ValueError(f"unknown mode {mode!r}: expected 'strict' or 'paper'") from None
+
+
+class SymmetrySpec:
+    """Declares how tensordict keys transform; keys it does not name are invariant.
+
+    Args:
+        keys: For each key, a :class:`Representation` (last dimension) or a
+            :class:`ScalarField` (last two dimensions). The entry under
+            ``("next", key)`` transforms like ``key``.
+
+    Example:
+        >>> spec = SymmetrySpec({"pixels": ScalarField(), "action": Representation("vector")})
+    """
+
+    def __init__(self, keys: Mapping[NestedKey, Representation | ScalarField]):
+        self.keys = dict(keys)
+
+    def transform(self, tensordict: TensorDictBase, element: Element) -> TensorDictBase:
+        """Applies one group element to every declared key; returns a new tensordict."""
+        out = tensordict.clone(recurse=False)
+        for key, rule, value in self._present(tensordict):
+            out.set(key, rule.transform(value, element))
+        return out
+
+    def rotate(self, tensordict: TensorDictBase, angles: Tensor) -> TensorDictBase:
+        """Rotates each row of a tensordict of batch size (B,) by its own angle.
+
+        Args:
+            tensordict: Images of shape (B, C, S, S), vectors of shape (B, dim).
+            angles: Shape (B,), in rad.
+
+        Returns:
+            A new tensordict; undeclared keys are shared with the input.
+        """
+        out = tensordict.clone(recurse=False)
+        for key, rule, value in self._present(tensordict):
+            out.set(key, rule.rotate(value, angles))
+        return out
+
+    def _present(
+        self, tensordict: TensorDictBase
+    ) -> list[tuple[NestedKey, Representation | ScalarField, Tensor]]:
+        present = []
+        for key, rule in self.keys.items():
+            nested = ("next", key) if isinstance(key, str) else ("next", *key)
+            for candidate in (key, nested):
+                value = tensordict.get(candidate, None)
+                if value is not None:
+                    present.append((candidate, rule, value))
+        return present
+
+
+def manipulation_spec() -> SymmetrySpec:
+    """The symmetry of planar manipulation: what turning the scene does to each key."""
+    return SymmetrySpec({"depth": ScalarField(), "action": ACTION})
