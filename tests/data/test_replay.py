@@ -1,0 +1,171 @@
+"""Replay buffer and its transforms."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from equirl.data import (
+    TRANSITION_KEYS,
+    QuantizeDepth,
+    RotationAugmentation,
+    load_replay_state,
+    make_replay_buffer,
+    replay_state,
+)
+from equirl.symmetry import Representation, SymmetrySpec, manipulation_spec
+
+
+def transitions(count: int, size: int = 16, seed: int = 0) -> TensorDict:
+    generator = torch.Generator().manual_seed(seed)
+
+    def rand(*shape: int) -> torch.Tensor:
+        return torch.rand(count, *shape, generator=generator)
+
+    def flags() -> torch.Tensor:
+        return torch.zeros(count, 1, dtype=torch.bool)
+
+    disc = torch.nn.functional.normalize(rand(2) - 0.5, dim=-1)
+    rest = 2 * rand(3) - 1
+    following = {"depth": 0.32 * rand(1, size, size), "holding": rand(1).round()}
+    following |= {"reward": rand(1).round(), "done": flags(), "terminated": flags()}
+    following["truncated"] = flags()
+    return TensorDict(
+        {
+            "depth": 0.32 * rand(1, size, size),
+            "holding": rand(1).round(),
+            "action": torch.cat([rest[:, :1], disc, rest[:, 1:]], -1),
+            "expert": flags(),
+            "next": following,
+        },
+        [count],
+    )
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def test_without_copies_what_is_sampled_is_what_was_stored():
+    stored = transitions(40)
+    buffer = make_replay_buffer(1000, copies=0, batch_size=64, generator=generator())
+    buffer.extend(stored)
+    batch = buffer.sample()
+    expected = stored[batch["index"]]
+    for key in TRANSITION_KEYS:
+        assert batch[key].dtype == expected[key].dtype
+        torch.testing.assert_close(batch[key], expected[key], atol=1e-5, rtol=0)
+
+
+def test_paper_setting_fits_in_memory_with_small_depth_error():
+    buffer = make_replay_buffer(100_000, copies=4, generator=generator())
+    stored = transitions(3, size=128)
+    buffer.extend(stored)
+    rows = buffer.storage[:3]
+    bytes_a_row = sum(leaf.nbytes for leaf in rows.values(True, True)) / 3
+    assert buffer.storage.max_size == 20_000
+    assert bytes_a_row * buffer.storage.max_size <= 1.5e9
+    packed = QuantizeDepth()
+    error = (packed.forward(packed.inv(stored.clone()))["depth"] - stored["depth"]).abs().max()
+    assert error < 2e-4
+
+
+def test_copies_turn_observation_next_observation_and_action_together():
+    stored = transitions(30)
+    buffer = make_replay_buffer(1000, copies=3, batch_size=512, generator=generator())
+    buffer.extend(stored)
+    angles = buffer.storage[:][RotationAugmentation.ANGLES]
+    batch = buffer.sample()
+    seen = set()
+    for row in batch:
+        index = int(row["index"])
+        versions = [
+            manipulation_spec().rotate(stored[index : index + 1], angle.reshape(1))[0]
+            for angle in angles[index]
+        ]
+        errors = [(version["action"] - row["action"]).abs().max().item() for version in versions]
+        version = min(range(4), key=errors.__getitem__)
+        seen.add(version)
+        torch.testing.assert_close(row["action"], versions[version]["action"])
+        for key in ("depth", ("next", "depth")):
+            torch.testing.assert_close(row[key], versions[version][key], atol=2e-5, rtol=0)
+        for key in ("holding", ("next", "holding"), ("next", "reward")):
+            torch.testing.assert_close(row[key], stored[index][key])
+    assert seen == {0, 1, 2, 3}
+
+
+def test_versions_are_drawn_uniformly_and_angles_cover_the_circle():
+    buffer = make_replay_buffer(50_000, copies=4, batch_size=5000, generator=generator())
+    buffer.extend(transitions(2000, size=2))
+    angles = buffer.storage[:][RotationAugmentation.ANGLES]
+    assert (angles[:, 0] == 0).all()
+    drawn = angles[:, 1:] / math.tau
+    assert 0 <= drawn.min() and drawn.max() < 1
+    assert abs(drawn.mean() - 0.5) < 0.02 and abs(drawn.var() - 1 / 12) < 0.005
+    batch = buffer.sample()
+    stored = transitions(2000, size=2)[batch["index"]]
+    unturned = (batch["action"] == stored["action"]).all(-1).float().mean()
+    assert abs(unturned - 1 / 5) < 0.03
+
+
+def test_sampling_does_not_alter_what_is_stored():
+    buffer = make_replay_buffer(1000, copies=4, batch_size=64, generator=generator())
+    buffer.extend(transitions(10))
+    before = buffer.storage[:].clone()
+    for _ in range(5):
+        buffer.sample()
+    assert (buffer.storage[:] == before).all()
+
+
+def test_actions_off_the_disc_are_clipped_to_their_box():
+    stored = transitions(50)
+    stored["action"] = torch.ones(50, 5)
+    buffer = make_replay_buffer(1000, copies=4, batch_size=256, generator=generator())
+    buffer.extend(stored)
+    action = buffer.sample()["action"]
+    assert action.abs().max() == 1
+    assert (action[:, 1:3].norm(dim=-1) < 1.3).any()  # some were cut
+
+
+def test_another_spec_and_bounds():
+    spec = SymmetrySpec({"velocity": Representation("vector")})
+    augment = RotationAugmentation(1, spec=spec, bounds={}, generator=generator())
+    data = TensorDict({"velocity": torch.tensor([[3.0, 4.0]]).expand(64, 2)}, [64])
+    turned = augment.forward(augment.inv(data.clone()))
+    torch.testing.assert_close(turned["velocity"].norm(dim=-1), torch.full((64,), 5.0))
+    assert (turned["velocity"] != data["velocity"]).any(-1).float().mean() > 0.2
+
+
+def test_same_generator_same_batches():
+    batches = []
+    for _ in range(2):
+        buffer = make_replay_buffer(1000, copies=4, batch_size=16, generator=generator(3))
+        buffer.extend(transitions(20))
+        torch.rand(7)  # the global generator plays no part
+        batches.append(buffer.sample())
+    assert (batches[0] == batches[1]).all()
+
+
+def test_state_restores_rows_cursor_and_draws():
+    source = generator(1)
+    buffer = make_replay_buffer(50, copies=4, batch_size=16, generator=source)
+    for seed in range(7):  # 14 transitions into 10 rows: the cursor has wrapped
+        buffer.extend(transitions(2, seed=seed))
+    state, rng = replay_state(buffer), source.get_state()
+    other_source = generator(2)
+    other = make_replay_buffer(50, copies=4, batch_size=16, generator=other_source)
+    load_replay_state(other, state)
+    other_source.set_state(rng)
+    for _ in range(2):
+        assert (buffer.sample() == other.sample()).all()
+        buffer.extend(transitions(1, seed=9))
+        other.extend(transitions(1, seed=9))
+    assert (buffer.storage[:] == other.storage[:]).all()
+
+
+def test_bad_arguments_are_named():
+    with pytest.raises(ValueError, match="copies must be 0 or more, got -1"):
+        RotationAugmentation(-1)
+    with pytest.raises(ValueError, match="capacity 3 cannot hold .* 4 copies"):
+        make_replay_buffer(3, copies=4)
