@@ -1,0 +1,5 @@
+"""Collectors of experience."""
+
+from equirl.collectors.demonstrations import DemonstrationCollector
+
+__all__ = ["DemonstrationCollector"]

@@ -1,0 +1,166 @@
+"""Expert demonstrations as a TorchRL collector."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.collectors import BaseCollector
+from torchrl.data import ReplayBuffer
+from torchrl.envs import EnvBase
+
+_OBSERVED = ("depth", "holding")
+_NEXT = (*_OBSERVED, "reward", "done", "terminated", "truncated")
+
+
+class DemonstrationCollector(BaseCollector):
+    """Yields successful episodes of an expert, one TensorDict each; failed ones are discarded.
+
+    An episode has shape [T] and exactly the keys ``depth``, ``holding``, ``action``, ``expert``
+    (T, 1) bool and True, and ``next``: ``depth``, ``holding``, ``reward``, ``done``,
+    ``terminated``, ``truncated``. An episode is successful when its last reward is positive.
+
+    Attempt k is a function of ``seed`` and k alone (given a deterministic policy): the collector
+    derives the environment's seed for it and leaves the environment in the attempt's final state.
+    Iterating again goes on with further episodes only after `set_seed` or `load_state_dict`.
+
+    Example:
+        >>> env = make_env("block_picking", seed=0)
+        >>> for episode in DemonstrationCollector(env, episodes=20, seed=1):
+        ...     buffer.extend(episode)
+
+    Args:
+        env: where to act; not batched.
+        policy: writes ``action``. Defaults to ``equirl.envs.make_expert(env)``.
+        episodes: how many successful episodes to yield in all.
+        seed: root of all randomness.
+        replay_buffer: if given, every episode is also written into it by one ``extend``.
+        max_failures: consecutive failed attempts that are given up on.
+
+    Attributes:
+        attempted: episodes tried so far.
+        episodes_collected: successful episodes so far.
+
+    Raises:
+        ValueError: on an argument out of range.
+        RuntimeError: while iterating, after ``max_failures`` failed attempts in a row.
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        policy: Callable[[TensorDictBase], TensorDictBase] | None = None,
+        *,
+        episodes: int,
+        seed: int,
+        replay_buffer: ReplayBuffer | None = None,
+        max_failures: int = 20,
+    ):
+        super().__init__()
+        if episodes < 0:
+            raise ValueError(f"episodes must be at least 0, got {episodes}")
+        if max_failures < 1:
+            raise ValueError(f"max_failures must be at least 1, got {max_failures}")
+        if env.batch_size:
+            raise ValueError(f"the environment must not be batched, got {env.batch_size}")
+        if policy is None:
+            from equirl.envs import make_expert
+
+            policy = make_expert(env)
+        self.env = env
+        self.policy = policy
+        self.replay_buffer = replay_buffer
+        self._episodes = episodes
+        self._max_failures = max_failures
+        self.closed = False
+        self.set_seed(seed)
+
+    def __len__(self) -> int:
+        """Number of episodes that are yielded in all."""
+        return self._episodes
+
+    def iterator(self) -> Iterator[TensorDictBase]:
+        """Yields successful episodes until there are ``episodes`` of them."""
+        failures = 0
+        while self.episodes_collected < self._episodes:
+            if self.closed:
+                raise RuntimeError("this collector was shut down; make a new one")
+            episode = self._attempt()
+            if episode["next", "reward"][-1].item() <= 0:
+                failures += 1
+                if failures >= self._max_failures:
+                    raise RuntimeError(
+                        f"{type(self.policy).__name__} failed {failures} episodes in a row (found "
+                        f"{self.episodes_collected} of {self._episodes} demonstrations in "
+                        f"{self.attempted} attempts); is it the expert of this environment?"
+                    )
+                continue
+            failures = 0
+            self.episodes_collected += 1
+            if self.replay_buffer is not None:
+                # Never `add`: it bypasses transforms that expand what is stored. A copy, because
+                # buffers write indices into what they are given.
+                self.replay_buffer.extend(episode.copy())
+            yield episode
+
+    @torch.no_grad()
+    def _attempt(self) -> TensorDictBase:
+        """Runs the next attempt and returns its transitions, shape [T]."""
+        root = np.random.SeedSequence(self._seed, spawn_key=(self.attempted,))
+        self.attempted += 1
+        self.env.set_seed(int(root.generate_state(1)[0]))
+        transitions = []
+        current, done = self.env.reset(), False
+        while not done:
+            step = self.env.step(self.policy(current.copy()))
+            transitions.append(self._transition(step))
+            current, done = step["next"].exclude("reward"), step["next", "done"].item()
+        return torch.stack(transitions)
+
+    @staticmethod
+    def _transition(step: TensorDictBase) -> TensorDict:
+        transition = step.select(*_OBSERVED, "action", *(("next", key) for key in _NEXT))
+        return transition.set("expert", torch.ones(1, dtype=torch.bool))
+
+    def set_seed(self, seed: int, static_seed: bool = False) -> int:
+        """Starts over from ``seed``: the next iteration yields ``episodes`` episodes again.
+
+        Returns:
+            A seed for another collector (the same one if ``static_seed``).
+        """
+        if seed < 0:
+            raise ValueError(f"seed must not be negative, got {seed}")
+        self._seed = int(seed)
+        self.attempted = 0
+        self.episodes_collected = 0
+        return seed if static_seed else seed + 1
+
+    def state_dict(self) -> OrderedDict:
+        """Returns what continues the collection after the episodes yielded so far."""
+        return OrderedDict(
+            seed=self._seed, attempted=self.attempted, episodes_collected=self.episodes_collected
+        )
+
+    def load_state_dict(self, state_dict: OrderedDict) -> None:
+        """Restores `state_dict`."""
+        self._seed = state_dict["seed"]
+        self.attempted = state_dict["attempted"]
+        self.episodes_collected = state_dict["episodes_collected"]
+
+    def shutdown(
+        self, timeout: float | None = None, close_env: bool = True, raise_on_error: bool = True
+    ) -> None:
+        """Ends the collection and closes the environment unless ``close_env`` is False."""
+        if close_env and not self.closed:
+            self.env.close(raise_if_closed=False)
+        self.closed = True
+
+    def __repr__(self) -> str:
+        """Names the collector, its policy and how far it is."""
+        return (
+            f"{type(self).__name__}({type(self.policy).__name__}, seed={self._seed}, "
+            f"{self.episodes_collected} of {self._episodes} episodes)"
+        )

@@ -1,0 +1,8 @@
+"""Simulated manipulation as TorchRL environments, with scripted experts."""
+
+from equirl.envs.experts import make_expert
+from equirl.envs.factory import make_env
+from equirl.envs.manipulation import ManipulationEnv
+from equirl.envs.scene import Scene
+
+__all__ = ["ManipulationEnv", "Scene", "make_env", "make_expert"]

@@ -1,0 +1,207 @@
+"""The decision process as a TorchRL environment (appendix of the paper, simulation set-up)."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from equirl.envs.bullet import Camera, Simulation
+from equirl.envs.heightmap import Heightmap, HeightmapSpec
+from equirl.envs.scene import Scene
+from equirl.envs.tasks import Task
+from equirl.envs.workspace import Workspace
+
+# Actions may exceed 1 by this much, which is rounding; they are clipped.
+_ACTION_TOLERANCE = 1e-6
+
+
+class ManipulationEnv(EnvBase):
+    """Top-down manipulation in a bin; one scene, no batch dimension.
+
+    A step moves the end effector, then the gripper, then observes, then judges.
+
+    Keys: ``depth`` (1, S, S) float32, metres below the end effector; ``holding`` (1,) float32, 0
+    or 1; ``action`` (5,) float32 in [-1, 1], order (gripper, x, y, z, theta); ``reward`` (1,)
+    float32, 1 on success, which terminates the episode, else 0. An object that leaves the
+    workspace without being held terminates it too.
+
+    Episode i after ``set_seed(s)`` is a function of s, i and the actions, bit for bit, whatever
+    was simulated before. An environment connects to PyBullet at its first reset, so that it can
+    be built in one process and used in another.
+
+    Use `equirl.envs.make_env`, which validates its arguments.
+
+    Args:
+        task: what is to be done.
+        image_size: S, pixels.
+        seed: as for `set_seed`.
+        robot: ``"panda"`` or ``"hand"`` (the free hand).
+        max_steps: length of an episode without success.
+        time_limit: ``"truncate"``: the last step is truncated, its value is bootstrapped;
+            ``"terminate"``: it is terminal.
+        workspace: dimensions of the cell.
+    """
+
+    batch_locked = True
+
+    def __init__(
+        self,
+        task: Task,
+        *,
+        image_size: int,
+        seed: int,
+        robot: str,
+        max_steps: int,
+        time_limit: Literal["truncate", "terminate"],
+        workspace: Workspace,
+    ):
+        super().__init__(device=None, batch_size=torch.Size([]))
+        self.task = task
+        self.workspace = workspace
+        self.max_steps = max_steps
+        self.time_limit = time_limit
+        self.robot = robot
+        self._heightmap = Heightmap(task.bodies, HeightmapSpec(image_size, task.view), workspace)
+        self._simulation: Simulation | None = None
+        self._camera: Camera | None = None
+        self._disconnected = False
+        self._steps = 0
+        self._make_specs(image_size)
+        self._set_seed(seed)
+
+    def _make_specs(self, size: int) -> None:
+        depth = Bounded(0.0, self._heightmap.spec.max_depth, shape=(1, size, size))
+        holding = Bounded(0.0, 1.0, shape=(1,))
+        self.observation_spec = Composite(depth=depth, holding=holding)
+        self.action_spec = Bounded(-1.0, 1.0, shape=(5,))
+        self.reward_spec = Unbounded(shape=(1,))
+        flags = ("done", "terminated", "truncated")
+        self.full_done_spec = Composite(
+            {flag: Binary(1, shape=(1,), dtype=torch.bool) for flag in flags}
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._seed_sequence = np.random.SeedSequence(seed)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        # One generator an episode: nothing drawn in an episode changes the next ones.
+        (child,) = self._seed_sequence.spawn(1)
+        objects = self.task.sample(np.random.default_rng(child))
+        space = self.workspace
+        home = np.array([0.0, 0.0, space.home_height])
+        return self.set_scene(Scene(home, 0.0, space.max_aperture, objects))
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        simulation = self._connected()
+        before = simulation.scene()
+        position, yaw, aperture = self._target(before, tensordict.get("action"))
+        simulation.act(position, yaw, aperture)
+        self._steps += 1
+        scene, held = simulation.scene(), simulation.held()
+        success = self.task.succeeded(scene, held)
+        out_of_time = self._steps >= self.max_steps
+        terminated = success or self._lost_object(scene, held)
+        if self.time_limit == "terminate":
+            terminated = terminated or out_of_time
+        step = self._observe(scene, held, terminated, out_of_time and not terminated)
+        step.set("reward", torch.tensor([float(success)]))
+        return step
+
+    def _target(self, scene: Scene, action: torch.Tensor) -> tuple[np.ndarray, float, float]:
+        """Returns the target position (m), yaw (rad) and aperture (m) of ``action`` (5,)."""
+        values = action.detach().cpu().numpy().astype(np.float64)
+        if values.shape != (5,) or not (np.abs(values) <= 1 + _ACTION_TOLERANCE).all():
+            raise ValueError(
+                "an action is five numbers (gripper, x, y, z, theta) in [-1, 1], "
+                f"got {values.tolist()}"
+            )
+        gripper, *displacement, theta = np.clip(values, -1, 1)
+        space = self.workspace
+        position = scene.position + space.position_step * np.array(displacement)
+        yaw = scene.yaw + space.yaw_step * theta
+        return space.clip(position), yaw, space.max_aperture * (gripper + 1) / 2
+
+    def _lost_object(self, scene: Scene, held: int | None) -> bool:
+        return any(
+            k != held and not self.workspace.contains(pose[:3], self.task.margin)
+            for k, pose in enumerate(scene.objects)
+        )
+
+    def _observe(
+        self, scene: Scene, held: int | None, terminated: bool = False, truncated: bool = False
+    ) -> TensorDict:
+        depth = torch.from_numpy(self._heightmap.draw(scene))[None]
+        values = {
+            "depth": depth,
+            "holding": torch.tensor([float(held is not None)]),
+            "done": torch.tensor([terminated or truncated]),
+            "terminated": torch.tensor([terminated]),
+            "truncated": torch.tensor([truncated]),
+        }
+        return TensorDict(values, batch_size=())
+
+    def _connected(self) -> Simulation:
+        if self._simulation is None:
+            if self._disconnected:
+                raise RuntimeError("this environment is closed; make a new one")
+            self._simulation = Simulation(self.task.bodies, self.robot, self.workspace)
+            self.is_closed = False  # so that EnvBase disconnects when this is collected
+        return self._simulation
+
+    def get_scene(self) -> Scene:
+        """Returns the measured state as a plain value (velocities are not part of it)."""
+        return self._connected().scene()
+
+    def set_scene(self, scene: Scene) -> TensorDictBase:
+        """Starts an episode, at rest, from ``scene``.
+
+        Args:
+            scene: poses of the gripper and of the task's objects.
+
+        Returns:
+            What `reset` returns, ready for an action and `step`.
+
+        Raises:
+            ValueError: if the scene has another number of objects than the task or the gripper is
+                outside the workspace.
+        """
+        if not self.workspace.contains(scene.position, margin=5e-3):
+            raise ValueError(
+                f"the end effector at {scene.position.tolist()} (m) is outside {self.workspace}"
+            )
+        simulation = self._connected()
+        simulation.place(scene)
+        self._steps = 0
+        return self._observe(simulation.scene(), simulation.held())
+
+    def held_object(self) -> int | None:
+        """Returns the index in `Scene.objects` of the object in the gripper, or None."""
+        return self._connected().held()
+
+    def render(self, width: int = 640, height: int = 480) -> np.ndarray:
+        """Returns a colour picture of the cell, shape (height, width, 3), uint8.
+
+        Needs no display. The first call loads the robot's meshes; what is simulated, and how fast,
+        does not change.
+        """
+        simulation = self._connected()
+        if self._camera is None:
+            self._camera = Camera(self.task.bodies, self.robot, self.workspace)
+        objects = simulation.scene().objects
+        return self._camera.picture(simulation.joint_values(), objects, width, height)
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Disconnects from PyBullet; harmless when done before."""
+        if self._simulation is not None:
+            self._simulation.close()
+            self._simulation = None
+        if self._camera is not None:
+            self._camera.close()
+            self._camera = None
+        self._disconnected = True
+        super().close(raise_if_closed=raise_if_closed)
