@@ -1,0 +1,135 @@
+"""The equivariant actor: a squashed Gaussian whose parameters turn with the scene."""
+
+from __future__ import annotations
+
+import torch
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.modules import ProbabilisticActor, TanhNormal
+
+from equirl.symmetry import SymmetryGroup, action_representation
+
+from .distributions import RadialTanhNormal
+from .encoder import EquivariantEncoder
+from .fields import FieldType
+from .steerable import SteerableLinear
+
+__all__ = ["LOG_STD_RANGE", "EquivariantPolicy", "make_actor"]
+
+#: Bounds of the logarithm of the standard deviation.
+LOG_STD_RANGE = (-20.0, 2.0)
+
+
+class EquivariantPolicy(nn.Module):
+    """Encoder and head: the Gaussian's mean, an action, and invariant standard deviations.
+
+    Args:
+        group: The symmetry group or its name.
+        hidden: Width of the encoder.
+        image_size: Side of the image in pixels.
+        mode: ``"strict"``: the mean transforms like the physical action and each of its
+            irreducible blocks has one standard deviation, so that x and y share theirs.
+            ``"paper"`` (appendix A): theta's mean is an invariant and each of the five
+            components has its own standard deviation.
+        device: Where the parameters live.
+        generator: Source of the initial weights; torch's global one if None.
+
+    Attributes:
+        in_type: Two trivial fields, depth and flag.
+        out_rep: The action's representation in this mode, which the mean obeys.
+    """
+
+    def __init__(
+        self,
+        group: SymmetryGroup | str,
+        *,
+        hidden: int = 64,
+        image_size: int = 128,
+        mode: str = "strict",
+        device: torch.device | str | None = None,
+        generator: torch.Generator | None = None,
+    ):
+        super().__init__()
+        self.out_rep = action_representation(mode)
+        self.encoder = EquivariantEncoder(
+            group, hidden=hidden, image_size=image_size, device=device, generator=generator
+        )
+        self.in_type = self.encoder.in_type
+        group = self.in_type.group
+        #: For each log standard deviation, how many components of the action it serves.
+        self.sharing = (
+            (1,) * self.out_rep.dim
+            if mode == "paper"
+            else tuple(irrep.dim for irrep in self.out_rep.irreps)
+        )
+        out_type = FieldType.of(group, self.out_rep) + FieldType.trivial(group, len(self.sharing))
+        self.head = SteerableLinear(self.encoder.out_type, out_type, generator=generator)
+        self.to(next(self.encoder.parameters()).device)
+
+    def forward(self, depth: Tensor, holding: Tensor) -> tuple[Tensor, Tensor]:
+        """Maps (*batch, 1, S, S) and (*batch, 1) to mean and deviation, both (*batch, 5)."""
+        out = self.head(self.encoder(depth, holding))
+        loc, log_std = out.split([self.out_rep.dim, len(self.sharing)], -1)
+        scale = log_std.clamp(*LOG_STD_RANGE).exp()
+        shared = zip(scale.split(1, -1), self.sharing, strict=True)
+        return loc, torch.cat([s.expand(*s.shape[:-1], count) for s, count in shared], -1)
+
+
+def make_actor(
+    group: SymmetryGroup | str,
+    *,
+    hidden: int = 64,
+    image_size: int = 128,
+    mode: str = "strict",
+    device: torch.device | str | None = None,
+    generator: torch.Generator | None = None,
+) -> ProbabilisticActor:
+    """An equivariant policy for soft actor-critic (paper, appendix A, figure 7 top).
+
+    Reads ``depth`` (*batch, 1, S, S) and ``holding`` (*batch, 1); writes ``loc``, ``scale``,
+    ``action`` (each (*batch, 5)) and ``action_log_prob``.
+
+    Parameters at the paper's size (``strict`` shares one deviation between x and y, and
+    has no bias on theta where reflections change its sign):
+
+    =====  =========  =========
+    group  strict     paper
+    =====  =========  =========
+    C4       557,087    557,152
+    C8     1,113,119  1,113,184
+    D4     1,113,118  1,113,184
+    D8     2,225,182  2,225,248
+    =====  =========  =========
+
+    Args:
+        group: The symmetry group or its name: any ``C<n>`` or ``D<n>``.
+        hidden: Number of regular fields; 64 in the paper. A multiple of 8 (16 for 256 px).
+        image_size: Side of the image: 16, 32, 64, 128 or 256 pixels.
+        mode: ``"strict"``: the distribution is exactly equivariant under the physical
+            action; x and y are squashed radially onto the unit disc. ``"paper"``: the
+            published policy, an elementwise squashed Gaussian with theta an invariant.
+        device: Where the parameters live; ``"auto"`` for the first GPU if there is one.
+        generator: Source of the initial weights, on the CPU; torch's global one if None.
+
+    Raises:
+        ValueError: An argument is none of the above.
+
+    Example:
+        >>> actor = make_actor("D4", hidden=16, image_size=64)
+    """
+    policy = EquivariantPolicy(
+        group,
+        hidden=hidden,
+        image_size=image_size,
+        mode=mode,
+        device=device,
+        generator=generator,
+    )
+    radial = mode == "strict"
+    return ProbabilisticActor(
+        TensorDictModule(policy, in_keys=["depth", "holding"], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=RadialTanhNormal if radial else TanhNormal,
+        distribution_kwargs={"representation": policy.out_rep} if radial else {},
+        return_log_prob=True,
+    )

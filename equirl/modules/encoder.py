@@ -1,0 +1,80 @@
+"""The equivariant encoder: from an image and the holding flag to regular fields."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from equirl.symmetry import SymmetryGroup
+
+from .fields import FieldType
+from .layout import check_sizes, pyramid, resolve_device, stack_observation
+from .steerable import SteerableConv
+
+__all__ = ["EquivariantEncoder"]
+
+
+class EquivariantEncoder(nn.Module):
+    """Seven steerable convolutions that shrink a 128-pixel image to one pixel.
+
+    Paper, appendix A and figure 7: every layer is a 3 x 3 convolution between regular
+    fields with a ReLU, and a 2 x 2 maximum after the first four and the sixth.
+
+    Args:
+        group: The symmetry group or its name.
+        hidden: Number of regular fields of the output, the paper's n.
+        image_size: Side of the image: 16, 32, 64, 128 or 256 pixels.
+        device: Where the parameters live; ``"auto"`` for the first GPU if there is one.
+        generator: Source of the initial weights; torch's global one if None.
+
+    Attributes:
+        in_type: Two trivial fields, depth and flag.
+        out_type: ``hidden`` regular fields.
+
+    Raises:
+        ValueError: The group, the width or the image size is not supported.
+    """
+
+    def __init__(
+        self,
+        group: SymmetryGroup | str,
+        *,
+        hidden: int = 64,
+        image_size: int = 128,
+        device: torch.device | str | None = None,
+        generator: torch.Generator | None = None,
+    ):
+        super().__init__()
+        check_sizes(hidden, image_size)
+        group, self.image_size = SymmetryGroup(group), image_size
+        self.in_type = FieldType.trivial(group, 2)
+        self.out_type = FieldType.regular(group, hidden)
+        # Fields out, padding and whether to pool, layer by layer.
+        rows = [(int(width * hidden), 1, True) for width in pyramid(image_size)]
+        rows += [(2 * hidden, 1, False), (hidden, 0, True), (hidden, 0, False)]
+        self.layers, self.pools = nn.ModuleList(), tuple(pool for _, _, pool in rows)
+        fields = self.in_type
+        for width, padding, _ in rows:
+            out = FieldType.regular(group, width)
+            self.layers.append(SteerableConv(fields, out, padding=padding, generator=generator))
+            fields = out
+        self.to(resolve_device(device))
+
+    def forward(self, depth: Tensor, holding: Tensor) -> Tensor:
+        """Encodes observations.
+
+        Args:
+            depth: Shape (*batch, 1, S, S), in metres.
+            holding: Shape (*batch, 1).
+
+        Returns:
+            Regular fields of shape (*batch, hidden * group order).
+        """
+        x = stack_observation(depth, holding, self.image_size)
+        for convolution, pool in zip(self.layers, self.pools, strict=True):
+            x = convolution(x)
+            if pool:  # before the ReLU, with which it commutes: a quarter of the work
+                x = F.max_pool2d(x, 2)
+            x = F.relu(x, inplace=True)
+        return x.reshape(*depth.shape[:-3], self.out_type.size)

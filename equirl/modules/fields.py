@@ -1,0 +1,165 @@
+"""Field types: how the channels of a feature map transform under a symmetry group."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from equirl.symmetry import Element, Irrep, Representation, SymmetryGroup
+
+__all__ = ["FieldType"]
+
+_REGULAR = "regular"
+_TRIVIAL, _SIGN, _VECTOR = Irrep.TRIVIAL.value, Irrep.SIGN.value, Irrep.VECTOR.value
+_VECTOR_X, _VECTOR_Y = "vector_x", "vector_y"
+
+
+@dataclass(frozen=True)
+class FieldType:
+    """A stack of fields of one group, in the order of the channels.
+
+    A *regular* field has one channel per group element, permuted by the group; the
+    other fields are the blocks of a :class:`~equirl.symmetry.Representation`,
+    restricted to the group. Where a restriction splits or merges blocks the fields
+    say so: a half turn acts on x and y alike, so for n = 2 a vector is two
+    one-dimensional fields, and without reflections a sign field is a trivial one.
+
+    Args:
+        group: The symmetry group.
+        fields: One name per field. Use the constructors below instead.
+    """
+
+    group: SymmetryGroup
+    fields: tuple[str, ...]
+
+    @classmethod
+    def regular(cls, group: SymmetryGroup, count: int) -> FieldType:
+        """``count`` regular fields."""
+        return cls(group, (_REGULAR,) * count)
+
+    @classmethod
+    def trivial(cls, group: SymmetryGroup, count: int) -> FieldType:
+        """``count`` invariant channels."""
+        return cls(group, (_TRIVIAL,) * count)
+
+    @classmethod
+    def of(cls, group: SymmetryGroup, representation: Representation) -> FieldType:
+        """The blocks of a representation, restricted to the group."""
+        fields: list[str] = []
+        for irrep in representation.irreps:
+            if irrep is Irrep.VECTOR and group.rotations == 2:
+                fields += [_VECTOR_X, _VECTOR_Y if group.reflections else _VECTOR_X]
+            elif irrep is Irrep.SIGN and not group.reflections:
+                fields.append(_TRIVIAL)
+            else:
+                fields.append(irrep.value)
+        return cls(group, tuple(fields))
+
+    def __add__(self, other: FieldType) -> FieldType:
+        """The fields of both, side by side.
+
+        Raises:
+            ValueError: The groups differ.
+        """
+        if self.group != other.group:
+            raise ValueError(f"cannot add fields of {self.group} and {other.group}")
+        return FieldType(self.group, self.fields + other.fields)
+
+    def dim(self, field: str) -> int:
+        """Number of channels of one field."""
+        if field == _REGULAR:
+            return self.group.order
+        return 2 if field == _VECTOR else 1
+
+    @cached_property
+    def size(self) -> int:
+        """Number of channels."""
+        return sum(self.dim(field) for field in self.fields)
+
+    @cached_property
+    def kinds(self) -> tuple[str, ...]:
+        """The different fields, in the order of their first appearance."""
+        return tuple(dict.fromkeys(self.fields))
+
+    def kind_size(self, kind: str) -> int:
+        """Number of channels of all fields of one kind."""
+        return self.fields.count(kind) * self.dim(kind)
+
+    @property
+    def is_regular(self) -> bool:
+        """Whether every field is regular."""
+        return all(field == _REGULAR for field in self.fields)
+
+    def bias_layout(self) -> tuple[list[int], list[float]]:
+        """Which bias each channel receives, and its weight.
+
+        Only the invariant part of a field may be shifted: one bias per regular field,
+        along its normalised constant vector, and one per trivial field.
+
+        Returns:
+            For each channel the index of its bias and the factor, 0 where none applies.
+        """
+        index, factor, count = [], [], 0
+        for field in self.fields:
+            has_bias = field in (_REGULAR, _TRIVIAL)
+            index += [count if has_bias else 0] * self.dim(field)
+            factor += [self.dim(field) ** -0.5 if has_bias else 0.0] * self.dim(field)
+            count += has_bias
+        return index, factor
+
+    @property
+    def bias_count(self) -> int:
+        """Number of biases: one per field that contains the trivial representation."""
+        return sum(field in (_REGULAR, _TRIVIAL) for field in self.fields)
+
+    def transform(self, x: Tensor, element: Element) -> Tensor:
+        """Applies a group element to the channels of ``x`` of shape (..., size).
+
+        Raises:
+            ValueError: The element is not in the group, or the size is not this type's.
+        """
+        if x.shape[-1] != self.size:
+            raise ValueError(f"expected {self.size} channels for {self}, got {tuple(x.shape)}")
+        source = self._source_elements(element)
+        parts, start = [], 0
+        for field in self.fields:
+            part = x[..., start : start + self.dim(field)]
+            start += self.dim(field)
+            parts.append(self._transform_field(part, field, element, source))
+        return torch.cat(parts, -1)
+
+    def _transform_field(
+        self, x: Tensor, field: str, element: Element, source: list[int]
+    ) -> Tensor:
+        if field == _REGULAR:
+            return x[..., source]
+        if field == _VECTOR_X:
+            return x * round(element.cos_sin[0])
+        if field == _VECTOR_Y:
+            return x * round(element.cos_sin[0]) * (-1 if element.reflected else 1)
+        return Representation(field).transform(x, element)
+
+    def _source_elements(self, element: Element) -> list[int]:
+        # A regular field is a function on the group; g moves its value at h to g h.
+        positions = {_key(h): index for index, h in enumerate(self.group.elements)}
+        if _key(element) not in positions:
+            raise ValueError(f"{element} is not an element of {self.group}")
+        return [positions[_key(element.inverse() @ h)] for h in self.group.elements]
+
+    def __str__(self) -> str:
+        runs: list[list] = []
+        for field in self.fields:
+            if runs and runs[-1][1] == field:
+                runs[-1][0] += 1
+            else:
+                runs.append([1, field])
+        return f"{self.group.name}[{' + '.join(f'{count} {field}' for count, field in runs)}]"
+
+
+def _key(element: Element) -> tuple[int, bool]:
+    # Angles that differ by rounding or by full turns are the same element.
+    return round(element.angle / math.tau * 1e6) % 1_000_000, element.reflected

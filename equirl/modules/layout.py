@@ -1,0 +1,76 @@
+"""What the equivariant and the plain encoder share: sizes, and how an observation enters."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+__all__ = ["IMAGE_SIZES", "check_sizes", "pyramid", "resolve_device", "stack_observation"]
+
+#: The image sizes the encoders are defined for.
+IMAGE_SIZES = (16, 32, 64, 128, 256)
+
+
+def check_sizes(hidden: int, image_size: int) -> None:
+    """Checks the width and the image size of an encoder.
+
+    Raises:
+        ValueError: The image size is not one of :data:`IMAGE_SIZES`, or the width cannot be
+            halved as often as the layers ask for.
+    """
+    if image_size not in IMAGE_SIZES:
+        raise ValueError(
+            f"image_size={image_size!r} is not supported: expected one of "
+            f"{', '.join(map(str, IMAGE_SIZES))} pixels"
+        )
+    divisor = 16 if image_size == 256 else 8
+    if not isinstance(hidden, int) or hidden <= 0 or hidden % divisor:
+        raise ValueError(
+            f"hidden={hidden!r} is not supported at image_size={image_size}: expected a positive "
+            f"multiple of {divisor}, for example {divisor}, {2 * divisor} or 64 (the paper's)"
+        )
+
+
+def pyramid(image_size: int) -> list[float]:
+    """Widths of the layers that halve the image down to 8 x 8, in units of ``hidden``.
+
+    The paper's four layers take 128 pixels to 8 (appendix A, figure 7); smaller images skip
+    the first of them, larger ones start with a narrower layer.
+    """
+    halvings = int(math.log2(image_size // 8))
+    return [2.0**-step for step in reversed(range(halvings))]
+
+
+def resolve_device(device: torch.device | str | None) -> torch.device:
+    """``"auto"`` is the first GPU if there is one; None is torch's default device."""
+    if device == "auto":
+        return torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
+    return torch.get_default_device() if device is None else torch.device(device)
+
+
+def stack_observation(depth: Tensor, holding: Tensor, image_size: int) -> Tensor:
+    """The two channels a network sees: the depth image, and the holding flag tiled.
+
+    Args:
+        depth: Shape (*batch, 1, S, S), in metres, as the paper feeds it.
+        holding: Shape (*batch, 1), 0 or 1.
+        image_size: The S expected.
+
+    Returns:
+        Shape (N, 2, S, S) with N the product of the batch dimensions, channels-last in
+        memory, the layout convolutions are fastest in.
+
+    Raises:
+        ValueError: The shapes are not these.
+    """
+    batch = depth.shape[:-3]
+    if depth.shape[-3:] != (1, image_size, image_size) or holding.shape != (*batch, 1):
+        raise ValueError(
+            f"expected depth (*batch, 1, {image_size}, {image_size}) and holding (*batch, 1), "
+            f"got {tuple(depth.shape)} and {tuple(holding.shape)}"
+        )
+    depth = depth.reshape(math.prod(batch), image_size, image_size)
+    flag = holding.to(depth.dtype).reshape(-1, 1, 1).expand_as(depth)
+    return torch.stack([depth, flag], -1).permute(0, 3, 1, 2)

@@ -1,0 +1,200 @@
+"""Our layers against escnn's with the same weights, and as well-behaved torch modules."""
+
+import copy
+import math
+import pickle
+
+import escnn.nn as enn
+import pytest
+import torch
+from escnn import gspaces
+from escnn.nn.init import _generalized_he_init_variances
+from torch.func import functional_call, stack_module_state, vmap
+
+from equirl.modules import FieldType, SteerableConv, SteerableLinear
+from equirl.symmetry import ACTION, ACTION_PAPER, SymmetryGroup
+
+slow = pytest.mark.slow
+FAST_GROUPS = ("C4", "D4")
+ALL_GROUPS = ("C4", "D4", *(pytest.param(g, marks=slow) for g in ("C2", "D2", "C3", "D3")))
+ALL_GROUPS += ("C8", "D8")
+
+
+def reference_type(fields):
+    """The same fields in escnn, its representations named by hand."""
+    n, mirrored = fields.group.rotations, fields.group.reflections
+    space = gspaces.flipRot2dOnR2(n) if mirrored else gspaces.rot2dOnR2(n)
+    kinds = {"regular": space.regular_repr, "trivial": space.trivial_repr}
+    if mirrored:
+        kinds |= {"sign": space.irrep(1, 0), "vector": space.irrep(1, 1)}
+        if n == 2:
+            kinds |= {"vector_x": space.irrep(0, 1), "vector_y": space.irrep(1, 1)}
+    else:
+        kinds |= {"vector": space.irrep(1), "vector_x": space.irrep(1)}
+    return enn.FieldType(space, [kinds[field] for field in fields.fields])
+
+
+def reference(ours):
+    """escnn's convolution with the weights of ours."""
+    conv = enn.R2Conv(
+        reference_type(ours.in_type),
+        reference_type(ours.out_type),
+        ours.kernel_size,
+        padding=getattr(ours, "padding", 0),
+        initialize=False,
+    ).train()
+    assert conv.weights.shape == ours.weights.shape
+    conv.weights.data.copy_(ours.weights.data)
+    if ours.bias is None:
+        assert conv.bias is None
+    else:
+        conv.bias.data.copy_(ours.bias.data)
+    return conv
+
+
+def randomise(layer):
+    with torch.no_grad():
+        for parameter in layer.parameters():
+            parameter.normal_()
+    return layer
+
+
+def field_types(group, name):
+    group = SymmetryGroup(group)
+    regular, trivial = (
+        (lambda n: FieldType.regular(group, n)),
+        (lambda n: FieldType.trivial(group, n)),
+    )
+    return {
+        "input": (trivial(2), regular(3)),
+        "hidden": (regular(2), regular(3)),
+        "actor": (regular(3), FieldType.of(group, ACTION) + trivial(4)),
+        "paper actor": (regular(3), FieldType.of(group, ACTION_PAPER) + trivial(5)),
+        "critic": (regular(3) + FieldType.of(group, ACTION), regular(2)),
+        "value": (trivial(3), trivial(1)),
+        "shuffled": (
+            FieldType.of(group, ACTION) + regular(1) + trivial(1),
+            trivial(1) + regular(2),
+        ),
+    }[name]
+
+
+@pytest.mark.parametrize("padding", [0, 1])
+@pytest.mark.parametrize("types", ["input", "hidden", "shuffled"])
+@pytest.mark.parametrize("group", ALL_GROUPS)
+def test_convolution_equals_escnn(group, types, padding):
+    torch.manual_seed(0)
+    ours = randomise(SteerableConv(*field_types(group, types), padding=padding))
+    theirs = reference(ours)
+    x = torch.randn(2, ours.in_type.size, 6, 6)
+    expected = theirs(theirs.in_type(x)).tensor
+    torch.testing.assert_close(ours(x), expected, atol=1e-5, rtol=1e-5)
+    precise = ours.double()(x.double())
+    assert precise.dtype == torch.float64
+    torch.testing.assert_close(precise, expected.double(), atol=2e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("types", ["hidden", "actor", "paper actor", "critic", "value", "shuffled"])
+@pytest.mark.parametrize("group", ALL_GROUPS)
+def test_linear_equals_escnn(group, types):
+    torch.manual_seed(0)
+    ours = randomise(SteerableLinear(*field_types(group, types)))
+    theirs = reference(ours)
+    x = torch.randn(4, ours.in_type.size)
+    expected = theirs(theirs.in_type(x[..., None, None])).tensor.flatten(1)
+    torch.testing.assert_close(ours(x), expected, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("group", FAST_GROUPS)
+def test_gradients_equal_escnn(group):
+    ours = randomise(SteerableConv(*field_types(group, "hidden"), padding=1))
+    theirs = reference(ours)
+    x = torch.randn(2, ours.in_type.size, 5, 5)
+    ours(x).square().sum().backward()
+    theirs(theirs.in_type(x)).tensor.square().sum().backward()
+    torch.testing.assert_close(ours.weights.grad, theirs.weights.grad, atol=1e-2, rtol=1e-4)
+    torch.testing.assert_close(ours.bias.grad, theirs.bias.grad, atol=1e-2, rtol=1e-4)
+
+
+@pytest.mark.parametrize("types", ["input", "hidden", "critic", "actor"])
+@pytest.mark.parametrize("group", ALL_GROUPS)
+def test_initial_variance_is_that_of_escnn(group, types):
+    torch.manual_seed(1)
+    layers = [SteerableConv(*field_types(group, types)) for _ in range(40)]
+    deviations = _generalized_he_init_variances(reference(layers[0])._basisexpansion)
+    weights = torch.stack([layer.weights.detach() for layer in layers])
+    for deviation in deviations.unique():
+        z = weights[:, deviations == deviation] / deviation
+        tolerance = 5 * math.sqrt(2 / z.numel())
+        assert abs(z.var().item() - 1) < tolerance
+        assert abs(z.mean().item()) < 5 / math.sqrt(z.numel())
+
+
+def test_float64_is_not_rounded_and_leaves_other_layers_alone():
+    types = field_types("D4", "hidden")
+    single, double = SteerableConv(*types), SteerableConv(*types).double()
+    assert single._bases[0].dtype == torch.float32
+    assert double._bases[0].dtype == torch.float64
+    assert not torch.equal(double._bases[0], double._bases[0].float().double())
+    once, back = double._bases[0].clone(), double.float().double()._bases[0]
+    assert torch.equal(once, back)
+    assert torch.isfinite(single(torch.randn(1, 16, 5, 5))).all()
+
+
+def test_state_dict_is_parameters_in_either_mode():
+    layer = SteerableConv(*field_types("D4", "hidden"))
+    training = {key: value.clone() for key, value in layer.train().state_dict().items()}
+    assert set(training) == {"weights", "bias"} == set(layer.eval().state_dict())
+    other = SteerableConv(*field_types("D4", "hidden")).eval()
+    other.load_state_dict(training)
+    x = torch.randn(1, 16, 5, 5)
+    assert torch.equal(layer(x), other(x))
+    with torch.no_grad():  # eval mode is not a frozen snapshot
+        other.weights.mul_(2)
+    assert not torch.equal(layer(x), other(x))
+
+
+def test_pickle_and_deepcopy():
+    layer, x = SteerableConv(*field_types("D4", "shuffled")), torch.randn(1, 14, 5, 5)
+    expected = layer(x)
+    for other in (pickle.loads(pickle.dumps(layer)), copy.deepcopy(layer)):
+        assert torch.equal(other(x), expected)
+        assert other._bases[0].data_ptr() != layer._bases[0].data_ptr()
+        assert other.double()(x.double()).dtype == torch.float64
+
+
+def test_vmap_over_stacked_parameters():
+    layers = [SteerableConv(*field_types("D4", "shuffled")) for _ in range(3)]
+    parameters, _ = stack_module_state(layers)
+    x = torch.randn(2, 14, 5, 5)
+    out = vmap(lambda p: functional_call(layers[0], p, (x,)))(parameters)
+    torch.testing.assert_close(out, torch.stack([layer(x) for layer in layers]))
+
+
+def test_filter_comes_out_channels_last():
+    filter = SteerableConv(*field_types("D4", "hidden")).filter()
+    assert filter.is_contiguous(memory_format=torch.channels_last)
+
+
+def test_a_generator_makes_the_weights_reproducible():
+    types = field_types("D4", "critic")
+
+    def weights(seed):
+        return SteerableLinear(*types, generator=torch.Generator().manual_seed(seed)).weights
+
+    before = torch.get_rng_state()
+    assert torch.equal(weights(3), weights(3))
+    assert not torch.equal(weights(3), weights(4))
+    assert torch.equal(before, torch.get_rng_state())
+
+
+def test_impossible_maps_are_refused():
+    c4, d4 = SymmetryGroup("C4"), SymmetryGroup("D4")
+    with pytest.raises(ValueError, match="one group"):
+        SteerableConv(FieldType.trivial(c4, 1), FieldType.trivial(d4, 1))
+    with pytest.raises(ValueError, match="zero map"):
+        SteerableLinear(FieldType.trivial(d4, 1), FieldType(d4, ("sign",)))
+
+
+def test_repr_names_the_fields():
+    assert "D4[2 trivial] -> D4[3 regular]" in repr(SteerableConv(*field_types("D4", "input")))
