@@ -1,0 +1,119 @@
+"""Soft actor-critic on TorchRL's loss, with one critic that holds both Q heads."""
+
+from __future__ import annotations
+
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictSequential
+from torch import Tensor
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.objectives import SACLoss as TorchRLSACLoss
+from torchrl.objectives import ValueEstimators
+from torchrl.objectives.sac import compute_rsample_log_prob
+
+from equirl.modules import shared_filters
+
+__all__ = ["SACLoss"]
+
+
+class SACLoss(TorchRLSACLoss):
+    """SAC losses for an actor and a critic of one encoder with several heads (appendix A).
+
+    TorchRL's loss duplicates the whole Q-network for each critic and encodes the state
+    anew for the actor's loss. Here the critic is a sequence of an encoder and heads: the
+    features of the state are computed once and serve both losses, the actor's loss
+    sends no gradient into the encoder or the heads, and every steerable filter is
+    expanded once a call. Values and gradients are those of the textbook computation.
+
+    Args:
+        actor: Stochastic policy, in_keys those of the observation.
+        critic: A sequence of two modules: the encoder, observation to features, and the
+            heads, features and action to ``state_action_value`` of shape (B, heads).
+        alpha: Initial entropy temperature.
+        target_entropy: Entropy that the temperature is tuned to, in nats.
+        gamma: Discount factor.
+
+    Forward:
+        Takes a tensordict of batch size (B,) and returns one of scalars ``loss_actor``,
+        ``loss_qvalue`` (the sum over heads of the mean squared errors), ``loss_alpha``,
+        ``alpha`` and ``entropy``; writes ``td_error`` (B,), the mean of the heads'
+        absolute errors, into its input. The sum of the three losses can be
+        differentiated at once: each reaches its own parameters only.
+
+    Raises:
+        TypeError: The critic is not a sequence of an encoder and heads.
+    """
+
+    def __init__(
+        self,
+        actor: ProbabilisticTensorDictSequential,
+        critic: TensorDictSequential,
+        *,
+        alpha: float = 1e-2,
+        target_entropy: float = -5.0,
+        gamma: float = 0.99,
+    ):
+        if not isinstance(critic, TensorDictSequential) or len(critic.module) != 2:
+            raise TypeError(
+                "the critic must be a TensorDictSequential of two modules, an encoder and "
+                f"heads that return (B, heads); got {type(critic).__name__}"
+            )
+        super().__init__(
+            actor,
+            critic,
+            num_qvalue_nets=None,
+            loss_function="l2",
+            alpha_init=alpha,
+            target_entropy=target_entropy,
+            # TorchRL would weight the actor's and the temperature's losses as well.
+            use_prioritized_weights=False,
+        )
+        self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
+        # Reading it once turns the lazy attribute into a buffer, part of the state dict.
+        _ = self.target_entropy
+
+    def _make_vmap(self) -> None:
+        """Replaces TorchRL's vmap over copies of a Q-network by one call of ours."""
+
+        def all_heads(tensordict: TensorDictBase, params: TensorDictParams) -> TensorDict:
+            with params.to_module(self.qvalue_network, preserve_module_state=False):
+                values = self.qvalue_network(tensordict.copy())
+            q = values.get(self.tensor_keys.state_action_value)
+            stacked = {self.tensor_keys.state_action_value: q.movedim(-1, 0).unsqueeze(-1)}
+            return TensorDict(stacked, [q.shape[-1], *tensordict.batch_size])
+
+        self._vmap_qnetworkN0 = all_heads
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The losses of a batch, see the class."""
+        with shared_filters():
+            return super().forward(tensordict)
+
+    def qvalue_v2_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Sum over heads of the mean squared Bellman error; keeps the state's features."""
+        target = self._compute_target_v2(tensordict)
+        encoder, heads = self.qvalue_network.module
+        with self.qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False):
+            values = encoder(tensordict.select(*self.qvalue_network.in_keys))
+            heads(values)
+        for key in encoder.out_keys:
+            tensordict.set(key, values.get(key).detach())
+        error = values.get(self.tensor_keys.state_action_value) - target.unsqueeze(-1)
+        loss = error.pow(2).mean(0).sum()
+        return loss, {"td_error": error.detach().abs().mean(-1)}
+
+    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Mean of alpha log pi(a|s) - min_i Q_i(s, a) over reparameterised actions a."""
+        with (
+            set_exploration_type(ExplorationType.RANDOM),
+            self.actor_network_params.to_module(self.actor_network, preserve_module_state=False),
+        ):
+            action, log_prob = compute_rsample_log_prob(self.actor_network.get_dist(tensordict))
+
+        encoder, heads = self.qvalue_network.module
+        values = tensordict.select(*encoder.out_keys).set(self.tensor_keys.action, action)
+        with self._cached_detached_qvalue_params.to_module(
+            self.qvalue_network, preserve_module_state=False
+        ):
+            heads(values)
+        q = values.get(self.tensor_keys.state_action_value).min(-1).values
+        return (self._alpha * log_prob - q).mean(), {"log_prob": log_prob.detach()}
