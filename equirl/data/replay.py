@@ -65,7 +65,8 @@ def replay_state(buffer: TensorDictReplayBuffer) -> dict[str, Any]:
 
     TorchRL's own state dict holds the whole capacity, filled or not.
     """
-    rows = buffer.storage[: len(buffer)].to_dict() if len(buffer) else {}
+    # A copy: a slice would drag the whole storage into the file.
+    rows = buffer.storage[: len(buffer)].clone().to_dict() if len(buffer) else {}
     return {"rows": rows, "size": len(buffer), "writer": buffer.writer.state_dict()}
 
 

@@ -43,6 +43,7 @@ class QuantizeDepth(Transform):
         return out
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Restores float32 metres in a sampled batch."""
         for key in self.in_keys:
             level = tensordict.get(key).float() + self._OFFSET
             tensordict.set(key, level * (self.maximum / self._LEVELS))
@@ -97,6 +98,7 @@ class RotationAugmentation(Transform):
         return out.set(self.ANGLES, angles)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Turns each row of a sampled batch (B,) into one of its n + 1 versions."""
         angles = tensordict.pop(self.ANGLES)
         (batch,) = tensordict.batch_size
         copy = torch.randint(self.copies + 1, (batch,), generator=self.generator)

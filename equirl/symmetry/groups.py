@@ -88,6 +88,7 @@ class SymmetryGroup:
 
     @property
     def name(self) -> str:
+        """``"C<n>"`` or ``"D<n>"``."""
         return f"{'D' if self.reflections else 'C'}{self.rotations}"
 
     @property

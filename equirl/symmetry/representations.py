@@ -28,6 +28,7 @@ class Irrep(Enum):
 
     @property
     def dim(self) -> int:
+        """Number of components."""
         return 2 if self is Irrep.VECTOR else 1
 
 
@@ -47,6 +48,7 @@ class Representation:
 
     @property
     def dim(self) -> int:
+        """Number of components of all blocks."""
         return sum(irrep.dim for irrep in self.irreps)
 
     @property

@@ -1,0 +1,127 @@
+"""The training collector: one environment step of the behaviour policy at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+
+from equirl.data import TRANSITION_KEYS
+
+__all__ = ["Episode", "OnlineCollector"]
+
+
+@dataclass(frozen=True)
+class Episode:
+    """Summary of a finished episode."""
+
+    index: int
+    length: int
+    rewards: float  # undiscounted return
+    discounted: float  # discounted return
+    success: bool
+
+
+class OnlineCollector:
+    """Steps one environment with a stochastic policy and hands out single transitions.
+
+    Every episode starts from a seed of its own, so an open episode is its number and
+    the actions taken: that is all its state dict holds, and loading one rebuilds the
+    episode in the simulator by replaying it.
+
+    Args:
+        env: A single environment (batch size ``()``).
+        policy: The behaviour policy; sampled, not greedy.
+        seeds: Maps the number of an episode to the seed of its scene.
+        discount: For the discounted return reported for each episode.
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        policy: TensorDictModuleBase,
+        seeds: Callable[[int], int],
+        *,
+        discount: float = 0.99,
+    ):
+        self.env = env
+        self.policy = policy
+        self.seeds = seeds
+        self.discount = discount
+        self.episode = 0
+        self._actions: list[torch.Tensor] = []
+        self._rewards: list[float] = []
+        self._current: TensorDictBase | None = None
+
+    def act(self) -> TensorDictBase:
+        """Chooses the next action; begins an episode when none is open.
+
+        Returns:
+            The current step, with keys of the observation and ``action``.
+        """
+        if self._current is None:
+            self._current = self._begin()
+        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+            return self.policy(self._current.copy())
+
+    def step(self, acted: TensorDictBase) -> tuple[TensorDict, Episode | None]:
+        """Takes the chosen action.
+
+        Args:
+            acted: What :meth:`act` returned.
+
+        Returns:
+            The transition, of batch size (1,) and the keys of
+            :data:`~equirl.data.TRANSITION_KEYS`, and the episode's summary if it ended.
+        """
+        assert self._current is not None
+        taken = self._current.copy().set("action", acted["action"].detach().cpu())
+        stepped = self._take(taken)
+        transition = stepped.copy().set("expert", torch.zeros(1, dtype=torch.bool))
+        transition = transition.select(*TRANSITION_KEYS).unsqueeze(0)
+        summary = self._close() if stepped["next", "done"].item() else None
+        return transition, summary
+
+    def state_dict(self) -> dict[str, Any]:
+        """The open episode: its number and the actions taken, shape (t, 5)."""
+        actions = torch.stack(self._actions) if self._actions else torch.zeros(0)
+        return {"episode": self.episode, "actions": actions}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Rebuilds the open episode from its seed and its actions."""
+        self.episode = state["episode"]
+        self._actions, self._rewards, self._current = [], [], None
+        for action in state["actions"]:
+            if self._current is None:
+                self._current = self._begin()
+            self._take(self._current.copy().set("action", action))
+
+    def _begin(self) -> TensorDictBase:
+        self.env.set_seed(self.seeds(self.episode), static_seed=True)
+        return self.env.reset()
+
+    def _take(self, taken: TensorDictBase) -> TensorDictBase:
+        stepped = self.env.step(taken)
+        self._actions.append(taken["action"])
+        self._rewards.append(stepped["next", "reward"].item())
+        self._current = step_mdp(stepped)
+        return stepped
+
+    def _close(self) -> Episode:
+        rewards = self._rewards
+        summary = Episode(
+            index=self.episode,
+            length=len(rewards),
+            rewards=sum(rewards),
+            discounted=sum(r * self.discount**t for t, r in enumerate(rewards)),
+            success=rewards[-1] > 0,
+        )
+        self.episode += 1
+        self._actions, self._rewards, self._current = [], [], None
+        return summary
