@@ -1,0 +1,270 @@
+"""The configuration of a run: typed, validated, and the same with or without Hydra."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import MISSING, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+__all__ = ["Config", "ConfigError", "load_config", "register", "save_config", "to_config"]
+
+
+class ConfigError(ValueError):
+    """A key or value that no run can have; the message names it."""
+
+
+@dataclass
+class EnvConfig:
+    """The task and what the robot sees of it."""
+
+    task: str = MISSING
+    image_size: int = 128  # pixels a side; networks take 16, 32, 64, 128 and 256
+    robot: str = "panda"  # "panda" or "hand", a free-flying gripper
+    max_steps: int = 50
+
+
+@dataclass
+class MethodConfig:
+    """The networks."""
+
+    name: str = MISSING  # "equivariant" or "cnn"
+    hidden: int = 64  # width n of the encoder (appendix A); the CNN scales with it
+
+
+@dataclass
+class AlgorithmConfig:
+    """Soft actor-critic (appendix D)."""
+
+    name: str = MISSING  # "sac"
+    learning_rate: float = 1e-3
+    batch_size: int = 64
+    discount: float = 0.99
+    tau: float = 1e-2  # share of the critic that moves into its target each update
+    alpha: float = 1e-2  # initial temperature
+    target_entropy: float = -5.0
+
+
+@dataclass
+class AugmentationConfig:
+    """Rotated copies of the replayed transitions (appendix F)."""
+
+    name: str = MISSING  # "buffer" or "none"
+    copies: int = 4
+
+
+@dataclass
+class DemosConfig:
+    """Expert demonstrations stored before training."""
+
+    episodes: int = 20
+
+
+@dataclass
+class ReplayConfig:
+    """The replay buffer."""
+
+    capacity: int = 100_000  # transitions, copies counted
+    start: int = 100  # transitions stored, copies counted, before updates begin
+
+
+@dataclass
+class EvaluationConfig:
+    """Greedy evaluation on scenes that training never sees."""
+
+    every: int = 200  # training steps between evaluations; 0: only after training
+    episodes: int = 20  # validation scenes an evaluation
+    final_episodes: int = 100  # test scenes after training
+    video_episodes: int = 3  # episodes of the learned policy filmed after training; 0: no video
+
+
+@dataclass
+class LoggingConfig:
+    """Where metrics go beside the CSV files of the run's folder."""
+
+    progress: bool = True
+    tensorboard: bool = False
+    wandb: bool = False
+    wandb_mode: str = "offline"  # or "online"
+    wandb_project: str = "equirl"
+
+
+@dataclass
+class Config:
+    """A training run."""
+
+    env: EnvConfig = field(default_factory=EnvConfig)
+    method: MethodConfig = field(default_factory=MethodConfig)
+    algorithm: AlgorithmConfig = field(default_factory=AlgorithmConfig)
+    augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
+    demos: DemosConfig = field(default_factory=DemosConfig)
+    replay: ReplayConfig = field(default_factory=ReplayConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    logging: LoggingConfig = field(default_factory=LoggingConfig)
+    mode: str = "strict"  # "strict" or "paper": the mathematics, independent of sizes
+    group: str = "D4"  # C<n> or D<n>
+    steps: int = 10_000  # environment steps, one update each
+    checkpoint_every: int = 500  # steps
+    seed: int = 0
+    device: str = "auto"  # "auto", "cpu" or "cuda:<i>"
+    threads: int = 0  # CPU threads of torch; 0: all cores
+
+    @property
+    def torch_device(self) -> str:
+        """The device, ``"auto"`` resolved."""
+        if self.device != "auto":
+            return self.device
+        import torch
+
+        return "cuda:0" if torch.cuda.is_available() else "cpu"
+
+    @property
+    def copies(self) -> int:
+        """Augmented copies of each stored transition."""
+        return self.augmentation.copies if self.augmentation.name == "buffer" else 0
+
+
+@dataclass
+class TrainJob(Config):
+    """What the command line of ``experiments/train.py`` takes: a run and its folder."""
+
+    output: str = ""  # the run's folder; a new one under outputs/ when empty
+    resume: str = ""  # folder of an interrupted run to go on with
+
+
+@dataclass
+class EvaluateJob:
+    """What the command line of ``experiments/evaluate.py`` takes."""
+
+    run: str = MISSING  # the folder of a run
+    episodes: int = 100
+    first: int = 0  # number of the first test scene
+    video: str = ""  # MP4 file to film the first episodes into
+    video_episodes: int = 3
+
+
+def validate(config: Config) -> Config:
+    """Checks every value that has a range.
+
+    Raises:
+        ConfigError: Names the first key whose value no run can have, and what it takes.
+    """
+    from equirl.symmetry import SymmetryGroup
+
+    def choice(key: str, value: object, *allowed: object) -> None:
+        if value not in allowed:
+            raise ConfigError(f"{key}={value}: expected one of {', '.join(map(str, allowed))}")
+
+    def at_least(key: str, value: float, lowest: float) -> None:
+        if not value >= lowest:
+            raise ConfigError(f"{key}={value}: expected {lowest} or more")
+
+    def within(key: str, value: float, low: float, high: float) -> None:
+        if not low < value <= high:
+            raise ConfigError(f"{key}={value}: expected a number above {low}, at most {high}")
+
+    try:
+        config.group = SymmetryGroup(config.group).name
+    except ValueError as error:
+        raise ConfigError(f"group={config.group}: {error}") from None
+    choice("mode", config.mode, "strict", "paper")
+    choice("env.robot", config.env.robot, "panda", "hand")
+    choice("method", config.method.name, "equivariant", "cnn")
+    choice("algorithm", config.algorithm.name, "sac")
+    choice("augmentation", config.augmentation.name, "buffer", "none")
+    choice("logging.wandb_mode", config.logging.wandb_mode, "offline", "online")
+    choice("env.image_size", config.env.image_size, 16, 32, 64, 128, 256)
+    multiple = 16 if config.env.image_size == 256 else 8
+    if config.method.hidden < multiple or config.method.hidden % multiple:
+        raise ConfigError(
+            f"method.hidden={config.method.hidden}: expected a multiple of {multiple} "
+            f"for images of {config.env.image_size} pixels"
+        )
+    at_least("env.max_steps", config.env.max_steps, 1)
+    at_least("algorithm.batch_size", config.algorithm.batch_size, 1)
+    at_least("augmentation.copies", config.augmentation.copies, 0)
+    at_least("demos.episodes", config.demos.episodes, 0)
+    at_least("replay.start", config.replay.start, 1)
+    at_least("replay.capacity", config.replay.capacity, config.copies + 1)
+    at_least("evaluation.every", config.evaluation.every, 0)
+    at_least("evaluation.episodes", config.evaluation.episodes, 1)
+    at_least("evaluation.final_episodes", config.evaluation.final_episodes, 1)
+    at_least("evaluation.video_episodes", config.evaluation.video_episodes, 0)
+    at_least("steps", config.steps, 1)
+    at_least("checkpoint_every", config.checkpoint_every, 1)
+    at_least("seed", config.seed, 0)
+    at_least("threads", config.threads, 0)
+    within("algorithm.learning_rate", config.algorithm.learning_rate, 0, 1)
+    within("algorithm.discount", config.algorithm.discount, 0, 1)
+    within("algorithm.tau", config.algorithm.tau, 0, 1)
+    within("algorithm.alpha", config.algorithm.alpha, 0, float("inf"))
+    _validate_device(config.device)
+    return config
+
+
+def _validate_device(device: str) -> None:
+    if device in ("auto", "cpu"):
+        return
+    import torch
+
+    try:
+        parsed = torch.device(device)
+    except RuntimeError:
+        parsed = None
+    if parsed is None or parsed.type != "cuda":
+        raise ConfigError(f"device={device}: expected auto, cpu or cuda:<i>")
+    if (parsed.index or 0) >= torch.cuda.device_count():
+        raise ConfigError(f"device={device}: this machine has {torch.cuda.device_count()} GPUs")
+
+
+def to_config(values: Any, schema: type[Config] = Config) -> Any:
+    """Turns a mapping (or an OmegaConf node) into a validated configuration.
+
+    Raises:
+        ConfigError: An unknown key, a value of the wrong type or out of range; named.
+    """
+    try:
+        merged = OmegaConf.merge(OmegaConf.structured(schema), values)
+        config = OmegaConf.to_object(merged)
+    except OmegaConfBaseException as error:
+        raise ConfigError(str(error).splitlines()[0] + f" (key {error.full_key})") from None
+    return validate(config) if isinstance(config, Config) else config
+
+
+def save_config(config: Config, path: Path) -> None:
+    """Writes the configuration as YAML."""
+    path.write_text(OmegaConf.to_yaml(OmegaConf.structured(config)))
+
+
+def load_config(path: Path) -> Config:
+    """Reads a configuration that :func:`save_config` wrote.
+
+    Raises:
+        ConfigError: The file is not one.
+    """
+    try:
+        values = OmegaConf.load(path)
+    except FileNotFoundError:
+        raise ConfigError(f"{path} not found: not the folder of a run") from None
+    return to_config(values)
+
+
+def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
+    """The configuration as ``{"env.task": ...}``, for comparing and logging."""
+    flat: dict[str, Any] = {}
+    for entry in fields(config):
+        value = getattr(config, entry.name)
+        key = prefix + entry.name
+        flat |= flatten(value, key + ".") if is_dataclass(value) else {key: value}
+    return flat
+
+
+def register() -> None:
+    """Makes the schema known to Hydra, so that every key of a YAML file is validated."""
+    from hydra.core.config_store import ConfigStore
+
+    store = ConfigStore.instance()
+    store.store(name="train_schema", node=TrainJob)
+    store.store(name="evaluate_schema", node=EvaluateJob)
