@@ -1,0 +1,101 @@
+"""Learning curves of runs as pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .statistics import moving_return
+from .tables import read_table
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["plot_run", "plot_runs"]
+
+_COLOURS = ("#0b6e99", "#d9730d", "#448361", "#9065b0", "#c14c8a")
+
+
+def plot_run(folder: Path, path: Path) -> None:
+    """Draws one run: behaviour return, greedy success, losses, entropy and temperature.
+
+    Args:
+        folder: The run's folder, with ``metrics.csv`` and ``validation.csv``.
+        path: The PNG file to write.
+    """
+    plt = _pyplot()
+    metrics = read_table(folder / "metrics.csv")
+    figure, axes = plt.subplots(2, 2, figsize=(9, 5.6), layout="constrained", sharex=True)
+    _draw_success(axes[0, 0], [folder], "validation", _COLOURS[0])
+    _draw_return(axes[0, 1], [folder], "behaviour policy", _COLOURS[1])
+    if metrics:
+        steps = metrics["step"]
+        axes[1, 0].plot(steps, metrics["loss_qvalue"], color=_COLOURS[2], lw=1)
+        axes[1, 0].set(title="critic loss", yscale="log", xlabel="environment steps")
+        axes[1, 1].plot(steps, metrics["entropy"], color=_COLOURS[3], lw=1)
+        axes[1, 1].set(title="policy entropy (nats)", xlabel="environment steps")
+    _save(figure, path)
+
+
+def plot_runs(groups: dict[str, Sequence[Path]], path: Path, *, title: str = "") -> None:
+    """Draws groups of runs over one another: greedy success and behaviour return.
+
+    Args:
+        groups: Run folders under the label they share in the legend; every run is a
+            thin line, their mean a thick one.
+        path: The PNG file to write.
+        title: Above the figure.
+    """
+    plt = _pyplot()
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
+    for colour, (label, folders) in zip(_COLOURS, groups.items(), strict=False):
+        _draw_success(left, folders, label, colour)
+        _draw_return(right, folders, label, colour)
+    left.legend(frameon=False)
+    figure.suptitle(title)
+    _save(figure, path)
+
+
+def _draw_success(axes: Axes, folders: Sequence[Path], label: str, colour: str) -> None:
+    tables = [table for folder in folders if (table := read_table(folder / "validation.csv"))]
+    for table in tables:
+        axes.plot(table["step"], table["success_rate"], color=colour, lw=1, alpha=0.4)
+        if len(tables) == 1:
+            axes.fill_between(table["step"], table["low"], table["high"], color=colour, alpha=0.15)
+    if tables:
+        length = min(len(table["step"]) for table in tables)
+        mean = np.mean([table["success_rate"][:length] for table in tables], axis=0)
+        axes.plot(tables[0]["step"][:length], mean, color=colour, lw=2, label=label)
+    axes.set(title="greedy success, held-out scenes", ylim=(-0.03, 1.03))
+    axes.set_xlabel("environment steps")
+
+
+def _draw_return(axes: Axes, folders: Sequence[Path], label: str, colour: str) -> None:
+    for folder in folders:
+        table = read_table(folder / "metrics.csv")
+        if table:
+            steps = np.asarray(table["step"])
+            returns = moving_return(steps, np.asarray(table["discounted_return"]))
+            axes.plot(steps, returns, color=colour, lw=1.4, alpha=0.8, label=label)
+            label = ""
+    axes.set(title="discounted return, previous 500 steps", ylim=(-0.03, 1.03))
+    axes.set_xlabel("environment steps")
+
+
+def _pyplot() -> Any:
+    import matplotlib
+
+    matplotlib.use("Agg")  # no display is needed
+    import matplotlib.pyplot as plt
+
+    plt.rcParams.update({"axes.spines.top": False, "axes.spines.right": False, "font.size": 9})
+    return plt
+
+
+def _save(figure: Figure, path: Path) -> None:
+    figure.savefig(path, dpi=110)
+    _pyplot().close(figure)
