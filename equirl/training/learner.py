@@ -1,0 +1,102 @@
+"""The learner: actor, critic and temperature, and one gradient step on all of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.modules import ProbabilisticActor
+from torchrl.objectives import SoftUpdate
+
+from equirl.config import Config, flatten
+from equirl.modules import make_actor, make_cnn_actor, make_cnn_critic, make_critic
+from equirl.objectives import SACLoss
+
+from .checkpoint import check_same_config, load_checkpoint
+from .folder import CHECKPOINT, load_run_config
+from .seeding import Purpose, torch_generator
+
+__all__ = ["Learner", "load_policy", "make_networks"]
+
+
+def make_networks(config: Config) -> tuple[ProbabilisticActor, torch.nn.Module]:
+    """Builds actor and critic of the configured method, initialised from the run's seed."""
+    size: dict[str, Any] = {
+        "hidden": config.method.hidden,
+        "image_size": config.env.image_size,
+        "generator": torch_generator(config.seed, Purpose.NETWORKS),
+        "device": config.torch_device,
+    }
+    if config.method.name == "cnn":
+        return make_cnn_actor(**size), make_cnn_critic(**size)
+    size["mode"] = config.mode
+    return make_actor(config.group, **size), make_critic(config.group, **size)
+
+
+class Learner:
+    """Soft actor-critic as the paper trains it (appendix D).
+
+    One update computes the three losses from one set of parameters, takes one Adam step
+    on each, then moves the target critic.
+
+    Args:
+        config: The run's configuration.
+    """
+
+    def __init__(self, config: Config):
+        algorithm = config.algorithm
+        self.actor, critic = make_networks(config)
+        self.loss = SACLoss(
+            self.actor,
+            critic,
+            alpha=algorithm.alpha,
+            target_entropy=algorithm.target_entropy,
+            gamma=algorithm.discount,
+        ).to(config.torch_device)
+        self.target_update = SoftUpdate(self.loss, tau=algorithm.tau)
+        self.optimizer = torch.optim.Adam(
+            self.loss.parameters(), lr=algorithm.learning_rate, fused=True
+        )
+
+    def update(self, batch: TensorDictBase) -> dict[str, float]:
+        """One gradient step.
+
+        Args:
+            batch: Transitions of batch size (B,).
+
+        Returns:
+            The losses, temperature and entropy, and the mean absolute Bellman error.
+        """
+        losses = self.loss(batch)
+        self.optimizer.zero_grad(set_to_none=True)
+        (losses["loss_actor"] + losses["loss_qvalue"] + losses["loss_alpha"]).backward()
+        self.optimizer.step()
+        self.target_update.step()
+        metrics = {key: losses[key].item() for key in self.loss.out_keys}
+        return metrics | {"td_error": batch["td_error"].mean().item()}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Networks, targets, temperature and optimiser."""
+        return {"loss": self.loss.state_dict(), "optimizer": self.optimizer.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`state_dict` returned."""
+        self.loss.load_state_dict(state["loss"])
+        self.optimizer.load_state_dict(state["optimizer"])
+
+
+def load_policy(folder: Path) -> tuple[Config, ProbabilisticActor]:
+    """The trained actor of a run's folder, with the run's configuration.
+
+    Raises:
+        ConfigError: The folder is not that of a run.
+        CheckpointError: It holds no readable checkpoint of that configuration.
+    """
+    config = load_run_config(folder)
+    state = load_checkpoint(folder / CHECKPOINT)
+    check_same_config(flatten(config), state["config"], folder / CHECKPOINT)
+    learner = Learner(config)
+    learner.load_state_dict(state["learner"])
+    return config, learner.actor

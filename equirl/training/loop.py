@@ -1,0 +1,249 @@
+"""The training run: demonstrations, then one update an environment step."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import torch
+from tqdm import tqdm
+
+from equirl.collectors import DemonstrationCollector
+from equirl.collectors.online import Episode, OnlineCollector
+from equirl.config import Config, flatten
+from equirl.data import load_replay_state, make_replay_buffer, replay_state
+from equirl.envs import ManipulationEnv, make_env, make_expert
+
+from .checkpoint import check_same_config, load_checkpoint, save_checkpoint
+from .evaluation import Evaluation, evaluate
+from .folder import CHECKPOINT
+from .learner import Learner
+from .metrics import MetricsLog
+from .seeding import Purpose, scene_seed, seed_everything, torch_generator
+from .timing import Stopwatch
+
+__all__ = ["TrainingRun", "make_run_env"]
+
+
+def make_run_env(config: Config, **options: Any) -> ManipulationEnv:
+    """The environment of a run; ``paper`` mode stores time-outs as terminal."""
+    return make_env(
+        config.env.task,
+        image_size=config.env.image_size,
+        robot=cast(Literal["panda", "hand"], config.env.robot),
+        max_steps=config.env.max_steps,
+        time_limit="terminate" if config.mode == "paper" else "truncate",
+        **options,
+    )
+
+
+class TrainingRun:
+    """One run of the paper's training (section 7 of its method, appendix D).
+
+    Construction builds everything from the configuration; :meth:`run` trains, going on
+    from the folder's checkpoint if there is one. A run stopped at any moment and
+    resumed is the run never stopped, bit for bit on one thread.
+
+    Args:
+        config: The run's configuration.
+        folder: Existing folder for metrics and checkpoints.
+        should_stop: Asked after each step; True ends the run with a checkpoint.
+    """
+
+    def __init__(
+        self, config: Config, folder: Path, should_stop: Callable[[], bool] = lambda: False
+    ):
+        if config.threads:
+            torch.set_num_threads(config.threads)
+        seed_everything(config.seed)
+        self.config, self.folder, self.should_stop = config, folder, should_stop
+        self.env = make_run_env(config)
+        self.evaluation_env = make_run_env(config)
+        self.learner = Learner(config)
+        self.generator = torch_generator(config.seed, Purpose.REPLAY)
+        self.buffer = make_replay_buffer(
+            config.replay.capacity,
+            copies=config.copies,
+            batch_size=config.algorithm.batch_size,
+            device=config.torch_device,
+            generator=self.generator,
+        )
+        self.collector = OnlineCollector(
+            self.env,
+            self.learner.actor,
+            partial(scene_seed, config.seed, Purpose.TRAINING),
+            discount=config.algorithm.discount,
+        )
+        self.log = MetricsLog(folder, config)
+        self.clock = Stopwatch()
+        self.step = 0
+        self._sums: dict[str, float] = {}
+        self._updates = 0
+        self._recent: deque[Episode] = deque(maxlen=20)
+
+    def run(self) -> Evaluation | None:
+        """Trains to the configured number of steps, then evaluates on the test scenes.
+
+        Returns:
+            The evaluation, or None when ``should_stop`` ended the run early.
+        """
+        try:
+            if (self.folder / CHECKPOINT).exists():
+                self._restore(load_checkpoint(self.folder / CHECKPOINT))
+            else:
+                self.log.rewind(-1)
+                self._collect_demonstrations()
+            if not self._train():
+                return None
+            return self._evaluate(Purpose.TEST, self.config.evaluation.final_episodes)
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """Ends the trackers and the simulations."""
+        self.log.close()
+        for env in (self.env, self.evaluation_env):
+            if not env.is_closed:
+                env.close()
+
+    def _collect_demonstrations(self) -> None:
+        if self.config.demos.episodes == 0:
+            return
+        clip: Literal["box", "norm"] = "box" if self.config.mode == "paper" else "norm"
+        demonstrations = DemonstrationCollector(
+            self.env,
+            make_expert(self.env, horizontal_clip=clip),
+            episodes=self.config.demos.episodes,
+            seed=scene_seed(self.config.seed, Purpose.DEMONSTRATIONS),
+            replay_buffer=self.buffer,
+        )
+        with self.clock.measure("demonstrations"):
+            for _ in demonstrations:
+                pass
+
+    def _train(self) -> bool:
+        """The loop of the paper; True when it reached the last step."""
+        config = self.config
+        with self._progress() as bar:
+            while self.step < config.steps:
+                with self.clock.measure("act"):
+                    acted = self.collector.act()
+                with self.clock.measure("environment"):
+                    transition, episode = self.collector.step(acted)
+                with self.clock.measure("replay"):
+                    self.buffer.extend(transition)
+                if len(self.buffer) * (config.copies + 1) >= config.replay.start:
+                    with self.clock.measure("replay"):
+                        batch = self.buffer.sample()
+                    with self.clock.measure("update"):
+                        self._accumulate(self.learner.update(batch))
+                self.step += 1
+                if episode:
+                    self._log_episode(episode)
+                if config.evaluation.every and self.step % config.evaluation.every == 0:
+                    self._validate()
+                self._show(bar)
+                stop = self.should_stop()
+                if stop or self.step % config.checkpoint_every == 0 or self.step == config.steps:
+                    self._save()
+                if stop and self.step < config.steps:
+                    return False
+        return True
+
+    def _accumulate(self, metrics: dict[str, float]) -> None:
+        self._updates += 1
+        for name, value in metrics.items():
+            self._sums[name] = self._sums.get(name, 0.0) + value
+
+    def _log_episode(self, episode: Episode) -> None:
+        self._recent.append(episode)
+        row: dict[str, float | int] = {
+            "step": self.step,
+            "episode": episode.index,
+            "length": episode.length,
+            "success": int(episode.success),
+            "return": episode.rewards,
+            "discounted_return": episode.discounted,
+        }
+        for name in (*self.learner.loss.out_keys, "td_error"):
+            row[name] = self._sums.get(name, 0.0) / max(self._updates, 1)
+        self.log.write("metrics", row)
+        self._sums, self._updates = {}, 0
+
+    def _validate(self) -> None:
+        outcome = self._evaluate(Purpose.VALIDATION, self.config.evaluation.episodes)
+        low, high = outcome.interval
+        row = {
+            "step": self.step,
+            "episodes": len(outcome.episodes),
+            "success_rate": outcome.success_rate,
+            "low": low,
+            "high": high,
+            "discounted_return": outcome.discounted,
+        }
+        self.log.write("validation", row)
+        self.log.write("timing", {"step": self.step, **self.clock.summary()})
+
+    def _evaluate(self, purpose: Purpose, episodes: int) -> Evaluation:
+        seeds = [scene_seed(self.config.seed, purpose, index) for index in range(episodes)]
+        with self.clock.measure("evaluation"):
+            return evaluate(
+                self.evaluation_env,
+                self.learner.actor,
+                seeds,
+                discount=self.config.algorithm.discount,
+            )
+
+    def _progress(self) -> AbstractContextManager[Any]:
+        if not self.config.logging.progress:
+            return nullcontext()
+        return tqdm(total=self.config.steps, initial=self.step, unit="step", dynamic_ncols=True)
+
+    def _show(self, bar: tqdm | None) -> None:
+        if bar is None:
+            return
+        if self._recent:
+            count = len(self._recent)
+            bar.set_postfix(
+                ret=f"{sum(e.discounted for e in self._recent) / count:.2f}",
+                success=f"{sum(e.success for e in self._recent) / count:.0%}",
+                update=f"{self.clock.mean('update') * 1e3:.0f}ms",
+                refresh=False,
+            )
+        bar.update(1)
+
+    def _save(self) -> None:
+        save_checkpoint(
+            {
+                "config": flatten(self.config),
+                "step": self.step,
+                "learner": self.learner.state_dict(),
+                "buffer": replay_state(self.buffer),
+                "collector": self.collector.state_dict(),
+                "sums": self._sums,
+                "updates": self._updates,
+                "recent": [vars(episode) for episode in self._recent],
+                "clock": self.clock.state_dict(),
+                "replay_rng": self.generator.get_state(),
+                "policy_rng": torch.get_rng_state(),
+            },
+            self.folder / CHECKPOINT,
+        )
+
+    def _restore(self, state: dict[str, Any]) -> None:
+        check_same_config(flatten(self.config), state["config"], self.folder / CHECKPOINT)
+        self.step = state["step"]
+        self.learner.load_state_dict(state["learner"])
+        load_replay_state(self.buffer, state["buffer"])
+        self.collector.load_state_dict(state["collector"])
+        self._sums, self._updates = state["sums"], state["updates"]
+        self._recent.extend(Episode(**episode) for episode in state["recent"])
+        self.clock.load_state_dict(state["clock"])
+        self.log.rewind(self.step)
+        # Last, since rebuilding the rest may draw random numbers.
+        self.generator.set_state(state["replay_rng"])
+        torch.set_rng_state(state["policy_rng"])

@@ -1,0 +1,87 @@
+"""Metrics of a run: CSV tables always, TensorBoard and wandb on request."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from equirl.config import Config, flatten
+
+__all__ = ["MetricsLog"]
+
+Row = Mapping[str, float | int]
+
+
+class MetricsLog:
+    """Appends rows to ``<table>.csv`` in the run's folder and forwards them to trackers.
+
+    Every row begins with ``step``. Wall-clock readings go to a table of their own
+    (``timing``), so that all other tables are a function of configuration and seed.
+
+    Args:
+        folder: The run's folder.
+        config: Says which trackers are wanted, and is shown there.
+    """
+
+    TABLES = ("metrics", "validation", "timing")
+
+    def __init__(self, folder: Path, config: Config):
+        self.folder = folder
+        self.trackers = _trackers(folder, config)
+
+    def rewind(self, step: int) -> None:
+        """Drops the rows after ``step``, which a resumed run will write again."""
+        for table in self.TABLES:
+            path = self.folder / f"{table}.csv"
+            if not path.exists():
+                continue
+            lines = path.read_text().splitlines(keepends=True)
+            kept = [line for line in lines[1:] if line.endswith("\n") and _step_of(line) <= step]
+            path.write_text("".join(lines[:1] + kept))
+
+    def write(self, table: str, row: Row) -> None:
+        """Appends one row; its first key must be ``step``."""
+        path = self.folder / f"{table}.csv"
+        new = not path.exists() or path.stat().st_size == 0
+        with open(path, "a", newline="") as file:
+            writer = csv.DictWriter(file, fieldnames=list(row), lineterminator="\n")
+            if new:
+                writer.writeheader()
+            writer.writerow(row)
+        for tracker in self.trackers:
+            for name, value in row.items():
+                if name != "step":
+                    tracker.log_scalar(f"{table}/{name}", value, step=int(row["step"]))
+
+    def close(self) -> None:
+        """Finishes the trackers, so that another run in this process starts its own."""
+        for tracker in self.trackers:
+            finish = getattr(tracker.experiment, "finish", None) or tracker.experiment.close
+            finish()
+
+
+def _step_of(line: str) -> float:
+    return float(line.split(",", 1)[0])
+
+
+def _trackers(folder: Path, config: Config) -> list[Any]:
+    trackers: list[Any] = []
+    if config.logging.tensorboard:
+        from torchrl.record.loggers.tensorboard import TensorboardLogger
+
+        trackers.append(TensorboardLogger("tensorboard", log_dir=str(folder)))
+    if config.logging.wandb:
+        from torchrl.record.loggers.wandb import WandbLogger
+
+        trackers.append(
+            WandbLogger(
+                exp_name=folder.name,
+                offline=config.logging.wandb_mode == "offline",
+                save_dir=str(folder),
+                project=config.logging.wandb_project,
+                config=flatten(config),
+            )
+        )
+    return trackers

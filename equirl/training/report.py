@@ -1,0 +1,82 @@
+"""What a finished run leaves in its folder: a page, curves and a video."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from equirl.analysis import read_table
+from equirl.analysis.curves import plot_run
+from equirl.config import Config
+
+from .evaluation import Evaluation
+
+__all__ = ["write_report"]
+
+
+def write_report(
+    folder: Path, config: Config, evaluation: Evaluation, *, video: Path | None = None
+) -> Path:
+    """Writes ``report.md`` with its curves.
+
+    Args:
+        folder: The run's folder.
+        config: The run's configuration.
+        evaluation: The trained policy on the test scenes.
+        video: The film of the learned policy, if one was made.
+
+    Returns:
+        The page's path.
+    """
+    plot_run(folder, folder / "curves.png")
+    timing = read_table(folder / "timing.csv")
+    low, high = evaluation.interval
+    solved = [episode.length for episode in evaluation.episodes if episode.success]
+    lines = [
+        f"# {config.env.task.replace('_', ' ').capitalize()}, {_networks(config)}",
+        "",
+        f"**{evaluation.success_rate:.0%} success** on {len(evaluation.episodes)} held-out "
+        f"scenes (95 % confidence interval {low:.0%} to {high:.0%}), greedy policy, after "
+        f"{config.steps:,} environment steps.",
+        "",
+        "| | |",
+        "| --- | --- |",
+        f"| mean discounted return | {evaluation.discounted:.3f} |",
+    ]
+    if solved:
+        lines.append(f"| mean length of a successful episode | {sum(solved) / len(solved):.1f} |")
+    if timing:
+        lines.append(f"| training time | {timing['minutes'][-1]:.1f} minutes |")
+        lines.append(f"| one update | {timing['update_ms'][-1]:.0f} ms |")
+    lines += [
+        f"| seed | {config.seed} |",
+        "",
+        "![Learning curves](curves.png)",
+        "",
+        "Left above: success of the greedy policy on validation scenes with its confidence "
+        "interval. Right above: what the exploring policy earned while training.",
+        "",
+    ]
+    if video:
+        lines += [f"The learned policy at work: [{video.name}]({video.name}).", ""]
+    failures = [str(episode.seed) for episode in evaluation.episodes if not episode.success]
+    if failures:
+        lines += [f"Seeds of the scenes it failed: {', '.join(failures)}.", ""]
+    lines += [
+        "| file | what |",
+        "| --- | --- |",
+        "| `config.yaml` | the resolved configuration |",
+        "| `checkpoint.pt` | networks, optimiser, replay buffer: all a resume needs |",
+        "| `metrics.csv` | a row a training episode |",
+        "| `validation.csv`, `test.csv` | greedy evaluations |",
+        "| `timing.csv` | milliseconds of each part of a step |",
+        "",
+    ]
+    page = folder / "report.md"
+    page.write_text("\n".join(lines))
+    return page
+
+
+def _networks(config: Config) -> str:
+    if config.method.name == "equivariant":
+        return f"{config.group}-equivariant SAC ({config.mode} mode)"
+    return f"{config.method.name.upper()} SAC"

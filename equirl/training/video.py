@@ -1,0 +1,71 @@
+"""Films of a policy: the scene beside what the network sees."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict.nn import TensorDictModuleBase
+
+from equirl.envs import ManipulationEnv
+
+from .evaluation import play
+
+__all__ = ["film_policy"]
+
+_SIDE = 384  # pixels of each of the two pictures
+_DEPTH_MAX = 0.32  # metres, the observation's range
+
+
+def film_policy(
+    env: ManipulationEnv,
+    policy: TensorDictModuleBase,
+    seeds: Sequence[int],
+    path: Path,
+    *,
+    fps: int = 4,
+) -> Path:
+    """Plays greedy episodes and writes them as one MP4, a frame a step.
+
+    Args:
+        env: Renders the scene.
+        policy: Acts deterministically.
+        seeds: The scenes.
+        path: The file to write.
+        fps: Frames a second.
+
+    Returns:
+        ``path``.
+    """
+    import imageio.v2 as imageio
+
+    writer: Any = imageio.get_writer(path, fps=fps, macro_block_size=None, quality=7)
+    with writer:
+
+        def film(depth: torch.Tensor) -> None:
+            writer.append_data(np.hstack([_fit(env.render()), _depth_picture(depth)]))
+
+        for seed in seeds:
+            play(env, policy, seed, on_step=film)
+    return path
+
+
+def _depth_picture(depth: torch.Tensor) -> np.ndarray:
+    """A depth image (1, S, S) in metres as an RGB picture, near is bright."""
+    import matplotlib
+
+    near = 1 - depth[0].clamp(0, _DEPTH_MAX).numpy() / _DEPTH_MAX
+    return _fit((matplotlib.colormaps["viridis"](near)[..., :3] * 255).astype(np.uint8))
+
+
+def _fit(picture: np.ndarray) -> np.ndarray:
+    """Crops a picture (H, W, 3) to a square and resizes it to the film's size."""
+    height, width = picture.shape[:2]
+    side = min(height, width)
+    top, left = (height - side) // 2, (width - side) // 2
+    picture = picture[top : top + side, left : left + side]
+    index = np.arange(_SIDE) * side // _SIDE
+    return picture[index][:, index]

@@ -1,0 +1,83 @@
+"""The direction of imports between the rooms of the package."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "equirl"
+
+#: What each room may import of ours, beside itself.
+ALLOWED = {
+    "symmetry": set(),
+    "modules": {"symmetry"},
+    "objectives": {"symmetry", "modules"},
+    "data": {"symmetry"},
+    "envs": {"symmetry"},
+    "collectors": {"symmetry", "data", "envs"},
+    "analysis": set(),
+    "training": {
+        "symmetry", "modules", "objectives", "data", "envs", "collectors", "analysis", "config",
+    },
+    "config": {"symmetry"},
+}  # fmt: skip
+
+#: Libraries that one place alone may import.
+CONFINED = {"pybullet": "envs/bullet", "escnn": "modules/bases.py", "hydra": "config.py"}
+
+
+def imports(path: Path) -> set[str]:
+    """Absolute module names a file imports, at any depth."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            if node.level:
+                package = path.relative_to(PACKAGE.parent).parent.parts
+                base = package[: len(package) - node.level + 1]
+                names.add(".".join([*base, *([node.module] if node.module else [])]))
+            elif node.module:
+                names.add(node.module)
+                names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+def files() -> list[Path]:
+    return sorted(PACKAGE.rglob("*.py"))
+
+
+@pytest.mark.parametrize("room", ALLOWED)
+def test_rooms_import_only_what_they_may(room):
+    for path in files():
+        parts = path.relative_to(PACKAGE).with_suffix("").parts
+        if parts[0] != room:
+            continue
+        used = {name.split(".")[1] for name in imports(path) if name.startswith("equirl.")}
+        rooms = used & set(ALLOWED)
+        assert rooms <= ALLOWED[room] | {room}, f"{path} imports {rooms - ALLOWED[room]}"
+
+
+def test_every_room_is_listed():
+    rooms = {path.relative_to(PACKAGE).with_suffix("").parts[0] for path in files()}
+    assert rooms - {"__init__"} == set(ALLOWED)
+
+
+@pytest.mark.parametrize(("library", "place"), CONFINED.items())
+def test_libraries_are_imported_in_one_place(library, place):
+    users = {
+        path.relative_to(PACKAGE).as_posix()
+        for path in files()
+        if any(name.split(".")[0] in {library, f"{library}_data"} for name in imports(path))
+    }
+    assert users and all(user.startswith(place) for user in users), users
+
+
+@pytest.mark.parametrize(
+    ("room", "absent"), [("modules", "pybullet"), ("envs", "escnn"), ("training", "hydra")]
+)
+def test_rooms_load_without_what_they_do_not_need(room, absent):
+    code = f"import sys, equirl.{room}; assert {absent!r} not in sys.modules"
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True)

@@ -1,0 +1,124 @@
+"""A run stopped and resumed is the run never stopped, bit for bit."""
+
+import shutil
+
+import pytest
+import torch
+
+from equirl.training import CHECKPOINT, CheckpointError, TrainingRun, load_checkpoint
+from equirl.training.checkpoint import save_checkpoint
+
+
+def run(config, folder, stop_after=None) -> TrainingRun:
+    folder.mkdir(exist_ok=True)
+    training = TrainingRun(config, folder)
+    if stop_after is not None:
+        training.should_stop = lambda: training.step >= stop_after
+    training.run()
+    return training
+
+
+def assert_same(first, second, where=""):
+    assert type(first) is type(second), where
+    if isinstance(first, torch.Tensor):
+        assert torch.equal(first, second), where
+    elif isinstance(first, dict):
+        assert first.keys() == second.keys(), where
+        for key in first:
+            assert_same(first[key], second[key], f"{where}/{key}")
+    elif isinstance(first, list | tuple):
+        assert len(first) == len(second), where
+        for index, pair in enumerate(zip(first, second, strict=True)):
+            assert_same(*pair, f"{where}/{index}")
+    else:
+        assert first == second, where
+
+
+def assert_same_run(first, second):
+    states = [load_checkpoint(folder / CHECKPOINT) for folder in (first, second)]
+    for state in states:
+        del state["clock"]
+        state["config"].pop("steps")
+    assert_same(*states)
+    for table in ("metrics.csv", "validation.csv"):
+        assert (first / table).read_bytes() == (second / table).read_bytes(), table
+
+
+@pytest.mark.parametrize("stops", [(7,), (10, 17)])
+def test_interrupted_run_equals_uninterrupted(tmp_path, small_config, stops):
+    config = small_config()
+    run(config, tmp_path / "whole")
+    for stop in stops:
+        stopped = run(config, tmp_path / "parts", stop_after=stop)
+        assert stopped.step == stop
+    run(config, tmp_path / "parts")
+    assert_same_run(tmp_path / "whole", tmp_path / "parts")
+
+
+def test_n_steps_and_n_more_equal_2n(tmp_path, small_config):
+    run(small_config(), tmp_path / "whole")
+    run(small_config(steps=12), tmp_path / "parts")
+    run(small_config(), tmp_path / "parts")
+    assert_same_run(tmp_path / "whole", tmp_path / "parts")
+
+
+def test_killed_run_goes_on_from_its_checkpoint_and_rewrites_rows(tmp_path, small_config):
+    """A process killed after step 19 leaves the checkpoint of step 10 and later rows."""
+    config = small_config()
+    run(config, tmp_path / "whole")
+    folder = tmp_path / "killed"
+    run(config, folder, stop_after=10)
+    kept = tmp_path / "kept.pt"
+    shutil.copy(folder / CHECKPOINT, kept)
+    run(config, folder, stop_after=19)
+    shutil.copy(kept, folder / CHECKPOINT)
+    with open(folder / "metrics.csv", "a") as file:
+        file.write("23,9,1")  # a row the kill cut short
+    run(config, folder)
+    assert_same_run(tmp_path / "whole", folder)
+
+
+def test_other_seed_other_run(tmp_path, small_config):
+    run(small_config(), tmp_path / "a")
+    run(small_config(seed=1), tmp_path / "b")
+    assert (tmp_path / "a/metrics.csv").read_text() != (tmp_path / "b/metrics.csv").read_text()
+
+
+def test_checkpoint_of_another_configuration_is_refused(tmp_path, small_config):
+    run(small_config(), tmp_path / "a", stop_after=3)
+    with pytest.raises(CheckpointError, match=r"group is C4 there and D4 here"):
+        run(small_config(group="D4"), tmp_path / "a")
+
+
+def test_damaged_checkpoint_is_named(tmp_path, small_config):
+    run(small_config(), tmp_path / "a", stop_after=3)
+    path = tmp_path / "a" / CHECKPOINT
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(CheckpointError, match="not a readable checkpoint"):
+        run(small_config(), tmp_path / "a")
+
+
+def test_checkpoints_load_without_executing_code(tmp_path):
+    class Payload:
+        def __reduce__(self):
+            return print, ("executed",)
+
+    path = tmp_path / "evil.pt"
+    torch.save({"format": 1, "payload": Payload()}, path)
+    with pytest.raises(CheckpointError):
+        load_checkpoint(path)
+
+
+def test_a_failed_write_keeps_the_previous_checkpoint(tmp_path, monkeypatch):
+    path = tmp_path / CHECKPOINT
+    save_checkpoint({"step": 1}, path)
+
+    def full(state, file):
+        file.write(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(torch, "save", full)
+    with pytest.raises(CheckpointError, match=r"No space left.*previous checkpoint is kept"):
+        save_checkpoint({"step": 2}, path)
+    assert load_checkpoint(path)["step"] == 1
+    assert [file.name for file in tmp_path.iterdir()] == [CHECKPOINT]
