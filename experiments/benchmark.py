@@ -1,0 +1,168 @@
+"""Measures environment, update and acting on this machine; prints Markdown tables.
+
+python experiments/benchmark.py
+python experiments/benchmark.py --only update --threads 2
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable
+
+os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # before TorchRL is imported
+
+import torch
+
+from equirl.collectors import DemonstrationCollector
+from equirl.config import Config, to_config
+from equirl.data import make_replay_buffer
+from equirl.envs import make_env, make_expert
+from equirl.modules import make_actor, make_critic
+from equirl.training import Learner
+
+
+def main() -> None:
+    """Runs the chosen tables."""
+    tables: dict[str, Callable[[argparse.Namespace], None]] = {
+        "environment": environment,
+        "build": build,
+        "update": update,
+        "acting": acting,
+    }
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", choices=tables, help="one table")
+    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("--steps", type=int, default=1000, help="environment steps to time")
+    parser.add_argument("--repeats", type=int, default=15, help="updates to time")
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
+    print(f"{platform.processor() or platform.machine()}, {arguments.threads} torch threads\n")
+    for name, table in tables.items():
+        if arguments.only in (None, name):
+            table(arguments)
+            print()
+
+
+def environment(arguments: argparse.Namespace) -> None:
+    """Steps a second of one environment, the expert acting, observation included."""
+    print("| robot | image | steps/s | steps/s with resets | reset ms |")
+    print("| --- | --- | --- | --- | --- |")
+    for robot in ("panda", "hand"):
+        for size in (64, 128):
+            env = make_env("block_picking", image_size=size, robot=robot)
+            expert = make_expert(env)
+            stepping, resetting = [], []
+            current = env.reset()
+            while len(stepping) < arguments.steps:
+                acted = expert(current)
+                start = time.process_time()
+                current = env.step(acted)["next"]
+                stepping.append(time.process_time() - start)
+                if current["done"].item():
+                    start = time.process_time()
+                    current = env.reset()
+                    resetting.append(time.process_time() - start)
+            env.close()
+            alone = len(stepping) / sum(stepping)
+            whole = len(stepping) / (sum(stepping) + sum(resetting))
+            reset = 1e3 * statistics.median(resetting)
+            print(f"| {robot} | {size} | {alone:.0f} | {whole:.0f} | {reset:.1f} |")
+
+
+def build(arguments: argparse.Namespace) -> None:
+    """Seconds to build an actor and a critic at the paper's size."""
+    print("| group | seconds | actor parameters | critic parameters |")
+    print("| --- | --- | --- | --- |")
+    for group in ("C4", "C8", "D4", "D8"):
+        start = time.perf_counter()
+        networks = make_actor(group), make_critic(group)
+        seconds = time.perf_counter() - start
+        counts = [f"{sum(p.numel() for p in net.parameters()):,}" for net in networks]
+        print(f"| {group} | {seconds:.2f} | {counts[0]} | {counts[1]} |")
+
+
+def update(arguments: argparse.Namespace) -> None:
+    """Milliseconds of one SAC update and its parts, medians."""
+    print(
+        "| group | hidden | image | batch | sample | losses | backward | Adam | target | update |"
+    )
+    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+    for group, hidden, size in (("D4", 8, 64), ("D4", 16, 64), ("C4", 16, 64), ("D4", 8, 32)):
+        config = _config(group, hidden, size)
+        learner, buffer = Learner(config), _filled_buffer(config)
+        parts: dict[str, list[float]] = {}
+        for _ in range(arguments.repeats + 2):
+            clock = _Clock(parts)
+            batch = buffer.sample()
+            clock("sample")
+            losses = learner.loss(batch)
+            clock("losses")
+            learner.optimizer.zero_grad(set_to_none=True)
+            (losses["loss_actor"] + losses["loss_qvalue"] + losses["loss_alpha"]).backward()
+            clock("backward")
+            learner.optimizer.step()
+            clock("adam")
+            learner.target_update.step()
+            clock("target")
+        medians = [1e3 * statistics.median(times[2:]) for times in parts.values()]
+        cells = " | ".join(f"{value:.1f}" for value in [*medians, sum(medians[1:])])
+        print(f"| {group} | {hidden} | {size} | {config.algorithm.batch_size} | {cells} |")
+
+
+def acting(arguments: argparse.Namespace) -> None:
+    """Milliseconds to choose one action from one observation, filters expanded each time."""
+    print("| group | hidden | image | act ms |")
+    print("| --- | --- | --- | --- |")
+    for group, hidden, size in (("D4", 8, 64), ("D4", 16, 64), ("D4", 64, 128)):
+        config = _config(group, hidden, size)
+        learner = Learner(config)
+        env = make_env("block_picking", image_size=size)
+        observation = env.reset()
+        times = []
+        for _ in range(arguments.repeats + 2):
+            start = time.perf_counter()
+            with torch.no_grad():
+                learner.actor(observation.copy())
+            times.append(time.perf_counter() - start)
+        env.close()
+        print(f"| {group} | {hidden} | {size} | {1e3 * statistics.median(times[2:]):.1f} |")
+
+
+class _Clock:
+    def __init__(self, parts: dict[str, list[float]]):
+        self.parts, self.last = parts, time.perf_counter()
+
+    def __call__(self, name: str) -> None:
+        now = time.perf_counter()
+        self.parts.setdefault(name, []).append(now - self.last)
+        self.last = time.perf_counter()
+
+
+def _config(group: str, hidden: int, size: int) -> Config:
+    return to_config(
+        {
+            "env": {"task": "block_picking", "image_size": size},
+            "method": {"name": "equivariant", "hidden": hidden},
+            "algorithm": {"name": "sac"},
+            "augmentation": {"name": "buffer"},
+            "group": group,
+        }
+    )
+
+
+def _filled_buffer(config: Config):
+    env = make_env(config.env.task, image_size=config.env.image_size)
+    buffer = make_replay_buffer(
+        10_000, batch_size=config.algorithm.batch_size, generator=torch.Generator()
+    )
+    for _ in DemonstrationCollector(env, episodes=10, seed=0, replay_buffer=buffer):
+        pass
+    return buffer
+
+
+if __name__ == "__main__":
+    main()

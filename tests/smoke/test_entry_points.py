@@ -1,0 +1,138 @@
+"""Every entry point end to end, as a user calls it."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+SMOKE = ["preset=smoke", "group=c4", "env.robot=hand", "logging.progress=false", "threads=1"]
+
+
+def start(script: str, *arguments: str) -> subprocess.Popen:
+    command = [sys.executable, str(ROOT / "experiments" / script), *arguments]
+    environment = {key: value for key, value in os.environ.items() if key != "DISPLAY"}
+    return subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+        env=environment | {"HOME": "/nonexistent"},  # no wandb login, no caches to rely on
+    )
+
+
+def call(script: str, *arguments: str) -> tuple[int, str, str]:
+    process = start(script, *arguments)
+    out, err = process.communicate(timeout=300)
+    return process.returncode, out, err
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Path:
+    """The folder of a finished run, which also logs to wandb and TensorBoard."""
+    folder = tmp_path_factory.mktemp("runs") / "finished"
+    trackers = ["logging.wandb=true", "logging.tensorboard=true"]
+    code, out, err = call("train.py", *SMOKE, *trackers, f"output={folder}")
+    assert code == 0, err
+    assert "episodes succeed" in out and str(folder / "report.md") in out
+    return folder
+
+
+def test_training_leaves_a_folder_worth_opening(finished):
+    report = (finished / "report.md").read_text()
+    assert "success" in report and "curves.png" in report and "policy.mp4" in report
+    assert (finished / "curves.png").read_bytes()[:4] == b"\x89PNG"
+    assert (finished / "policy.mp4").stat().st_size > 1000
+    for table, rows in (("metrics.csv", 2), ("validation.csv", 2), ("test.csv", 3)):
+        with open(finished / table) as file:
+            assert len(list(csv.DictReader(file))) >= rows, table
+    assert "group: C4" in (finished / "config.yaml").read_text()
+    assert list(finished.glob("wandb/offline-run-*"))
+    assert list(finished.glob("tensorboard/**/events*"))
+
+
+def test_evaluation_of_a_finished_run(finished, tmp_path):
+    film = tmp_path / "film.mp4"
+    code, out, err = call("evaluate.py", f"run={finished}", "episodes=2", f"video={film}")
+    assert code == 0, err
+    assert "of 2 episodes succeed" in out and "95 % confidence interval" in out
+    assert film.stat().st_size > 1000
+
+
+def test_interrupt_stops_with_a_checkpoint_and_resume_goes_on(tmp_path):
+    folder = tmp_path / "run"
+    process = start("train.py", *SMOKE, "steps=100000", f"output={folder}")
+    deadline = time.monotonic() + 120
+    while not (folder / "metrics.csv").exists() and time.monotonic() < deadline:
+        time.sleep(0.2)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 1 and f"resume={folder}" in err, err
+    config = (folder / "config.yaml").read_text()
+    with open(folder / "metrics.csv") as file:
+        step = int(list(csv.DictReader(file))[-1]["step"])
+    (folder / "config.yaml").write_text(config.replace("steps: 100000", f"steps: {step + 20}"))
+    code, out, err = call("train.py", f"resume={folder}")
+    assert code == 0, err
+    assert "episodes succeed" in out
+    with open(folder / "metrics.csv") as file:
+        steps = [int(row["step"]) for row in csv.DictReader(file)]
+    assert steps == sorted(set(steps)) and steps[-1] <= step + 20
+
+
+def test_multirun_over_groups_and_copies(tmp_path):
+    code, _, err = call(
+        "train.py",
+        "--multirun",
+        *(key for key in SMOKE if not key.startswith("group")),
+        "group=c4,d4",
+        "augmentation.copies=0,2",
+        "steps=6",
+        "demos.episodes=1",
+        "evaluation.final_episodes=1",
+        "evaluation.video_episodes=0",
+        f"hydra.sweep.dir={tmp_path}",
+    )
+    assert code == 0, err
+    reports = list(tmp_path.glob("*/report.md"))
+    assert len(reports) == 4
+    configs = "".join((report.parent / "config.yaml").read_text() for report in reports)
+    assert configs.count("group: D4") == 2 and configs.count("copies: 0") == 2
+
+
+def test_cnn_baseline(tmp_path):
+    code, out, err = call("train.py", *SMOKE, "method=cnn", "steps=6", f"output={tmp_path}/cnn")
+    assert code == 0, err
+    assert "CNN SAC" in (tmp_path / "cnn" / "report.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["group=so3"], "group=so3"),
+        (["method=drq"], "drq"),
+        (["algorithm=sacfd"], "sacfd"),
+        (["env=block_stacking"], "block_stacking"),
+        (["env.image_size=100"], "env.image_size=100: expected one of 16, 32, 64, 128, 256"),
+        (["colour=red"], "colour"),
+        (["device=cuda:7"], "device=cuda:7"),
+        (["output=/proc/none"], "/proc/none"),
+    ],
+)
+def test_bad_input_ends_in_a_sentence_that_names_it(arguments, named):
+    code, _, err = call("train.py", *SMOKE, *arguments)
+    assert code != 0
+    assert named in err and "Traceback" not in err
+
+
+def test_benchmark_prints_its_tables():
+    code, out, err = call("benchmark.py", "--steps", "20", "--repeats", "1")
+    assert code == 0, err
+    assert "| panda | 64 |" in out and "| D4 | 1,113,184 |" not in out.split("build")[0][:0]
+    assert "1,113,184" in out
