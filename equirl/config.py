@@ -45,6 +45,7 @@ class AlgorithmConfig:
     tau: float = 1e-2  # share of the critic that moves into its target each update
     alpha: float = 1e-2  # initial temperature
     target_entropy: float = -5.0
+    averaging: float = 0.0  # decay of the average of the actor that is evaluated; 0: none
 
 
 @dataclass
@@ -199,6 +200,11 @@ def validate(config: Config) -> Config:
     within("algorithm.learning_rate", config.algorithm.learning_rate, 0, 1)
     within("algorithm.discount", config.algorithm.discount, 0, 1)
     within("algorithm.tau", config.algorithm.tau, 0, 1)
+    if not 0 <= config.algorithm.averaging < 1:
+        raise ConfigError(
+            f"algorithm.averaging={config.algorithm.averaging}: expected a decay of 0 or more, "
+            "below 1"
+        )
     within("algorithm.alpha", config.algorithm.alpha, 0, float("inf"))
     _validate_device(config.device)
     return config

@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from torch.optim.swa_utils import AveragedModel
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import SoftUpdate
 
@@ -39,7 +40,10 @@ class Learner:
     """Soft actor-critic as the paper trains it (appendix D).
 
     One update computes the three losses from one set of parameters, takes one Adam step
-    on each, then moves the target critic.
+    on each, then moves the target critic. The actor's steps chase a moving critic, so it
+    swings about the policy it is learning; on request an exponential moving average of
+    its parameters (Polyak averaging) is kept as the policy to evaluate. Experience is
+    always collected with the actor itself.
 
     Args:
         config: The run's configuration.
@@ -56,9 +60,15 @@ class Learner:
             gamma=algorithm.discount,
         ).to(config.torch_device)
         self.target_update = SoftUpdate(self.loss, tau=algorithm.tau)
+        self.average = _average(self.actor, algorithm.averaging) if algorithm.averaging else None
         self.optimizer = torch.optim.Adam(
             self.loss.parameters(), lr=algorithm.learning_rate, fused=True
         )
+
+    @property
+    def policy(self) -> ProbabilisticActor:
+        """The policy to evaluate and to keep: the actor, or its average over recent updates."""
+        return self.actor if self.average is None else self.average.module
 
     def update(self, batch: TensorDictBase) -> dict[str, float]:
         """One gradient step.
@@ -74,21 +84,37 @@ class Learner:
         (losses["loss_actor"] + losses["loss_qvalue"] + losses["loss_alpha"]).backward()
         self.optimizer.step()
         self.target_update.step()
+        if self.average is not None:
+            self.average.update_parameters(self.actor)
         metrics = {key: losses[key].item() for key in self.loss.out_keys}
         return metrics | {"td_error": batch["td_error"].mean().item()}
 
     def state_dict(self) -> dict[str, Any]:
-        """Networks, targets, temperature and optimiser."""
-        return {"loss": self.loss.state_dict(), "optimizer": self.optimizer.state_dict()}
+        """Networks, targets, temperature, optimiser and average."""
+        state = {"loss": self.loss.state_dict(), "optimizer": self.optimizer.state_dict()}
+        if self.average is not None:
+            state["average"] = self.average.state_dict()
+        return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores what :meth:`state_dict` returned."""
         self.loss.load_state_dict(state["loss"])
         self.optimizer.load_state_dict(state["optimizer"])
+        if self.average is not None:
+            self.average.load_state_dict(state["average"])
+
+
+def _average(actor: ProbabilisticActor, decay: float) -> AveragedModel:
+    """An exponential moving average of the actor, a plain mean while it is young."""
+
+    def move(average: torch.Tensor, current: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
+        return torch.lerp(average, current, max(1 - decay, 1 / (int(count) + 1)))
+
+    return AveragedModel(actor, avg_fn=move)
 
 
 def load_policy(folder: Path) -> tuple[Config, ProbabilisticActor]:
-    """The trained actor of a run's folder, with the run's configuration.
+    """The trained policy of a run's folder, with the run's configuration.
 
     Raises:
         ConfigError: The folder is not that of a run.
@@ -99,4 +125,4 @@ def load_policy(folder: Path) -> tuple[Config, ProbabilisticActor]:
     check_same_config(flatten(config), state["config"], folder / CHECKPOINT)
     learner = Learner(config)
     learner.load_state_dict(state["learner"])
-    return config, learner.actor
+    return config, learner.policy

@@ -193,7 +193,7 @@ class TrainingRun:
         with self.clock.measure("evaluation"):
             return evaluate(
                 self.evaluation_env,
-                self.learner.actor,
+                self.learner.policy,
                 seeds,
                 discount=self.config.algorithm.discount,
             )

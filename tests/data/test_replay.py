@@ -101,7 +101,7 @@ def test_versions_are_drawn_uniformly_and_angles_cover_the_circle():
     angles = buffer.storage[:][RotationAugmentation.ANGLES]
     assert (angles[:, 0] == 0).all()
     drawn = angles[:, 1:] / math.tau
-    assert 0 <= drawn.min() and drawn.max() < 1
+    assert drawn.min() >= 0 and drawn.max() < 1
     assert abs(drawn.mean() - 0.5) < 0.02 and abs(drawn.var() - 1 / 12) < 0.005
     batch = buffer.sample()
     stored = transitions(2000, size=2)[batch["index"]]

@@ -44,9 +44,9 @@ def assert_same_run(first, second):
         assert (first / table).read_bytes() == (second / table).read_bytes(), table
 
 
-@pytest.mark.parametrize("stops", [(7,), (10, 17)])
-def test_interrupted_run_equals_uninterrupted(tmp_path, small_config, stops):
-    config = small_config()
+@pytest.mark.parametrize(("stops", "averaging"), [((7,), 0.0), ((10, 17), 0.9)])
+def test_interrupted_run_equals_uninterrupted(tmp_path, small_config, stops, averaging):
+    config = small_config(algorithm={"averaging": averaging})
     run(config, tmp_path / "whole")
     for stop in stops:
         stopped = run(config, tmp_path / "parts", stop_after=stop)

@@ -1,0 +1,96 @@
+"""One gradient step, and the policy that is kept."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from equirl.training import TrainingRun, load_policy, train
+from equirl.training.learner import Learner
+
+
+def batch(count: int = 4, size: int = 16) -> TensorDict:
+    generator = torch.Generator().manual_seed(0)
+
+    def observation():
+        depth = 0.3 * torch.rand(count, 1, size, size, generator=generator)
+        return {"depth": depth, "holding": torch.zeros(count, 1)}
+
+    flag = torch.zeros(count, 1, dtype=torch.bool)
+    following = {"reward": torch.ones(count, 1), "done": flag, "terminated": flag}
+    action = torch.rand(count, 5, generator=generator) - 0.5
+    return TensorDict(
+        observation() | {"action": action, "next": observation() | following}, [count]
+    )
+
+
+def values(module) -> list[torch.Tensor]:
+    return [p.detach().clone() for p in module.parameters()]
+
+
+def test_target_moves_by_tau_towards_the_critic_as_it_is_after_the_step(small_config):
+    learner = Learner(small_config(algorithm={"tau": 0.25}))
+    target = learner.loss.target_qvalue_network_params
+    before = target.clone()
+    learner.update(batch())
+    expected = before.lerp(learner.loss.qvalue_network_params.data, 0.25)
+    for key, value in target.items(True, True):
+        torch.testing.assert_close(value, expected[key])
+    assert any((value != before[key]).any() for key, value in target.items(True, True))
+
+
+def test_every_trained_parameter_moves(small_config):
+    learner = Learner(small_config())
+    before = {name: p.detach().clone() for name, p in learner.loss.named_parameters()}
+    learner.update(batch())
+    learner.update(batch())
+    for name, parameter in learner.loss.named_parameters():
+        if not name.startswith("target"):
+            assert not torch.equal(parameter, before[name]), name
+
+
+def test_average_is_a_plain_mean_at_first_and_exponential_later(small_config):
+    learner = Learner(small_config(algorithm={"averaging": 0.75}))
+    history = []
+    expected = None
+    for count in range(8):
+        learner.update(batch())
+        history.append(values(learner.actor))
+        share = max(0.25, 1 / (count + 1))
+        expected = (
+            history[0]
+            if expected is None
+            else [old.lerp(new, share) for old, new in zip(expected, history[-1], strict=True)]
+        )
+    for ours, plain in zip(values(learner.policy), expected, strict=True):
+        torch.testing.assert_close(ours, plain)
+    assert learner.policy is not learner.actor
+    assert any((a != b).any() for a, b in zip(values(learner.policy), history[-1], strict=True))
+
+
+def test_without_averaging_the_actor_itself_is_kept(small_config):
+    learner = Learner(small_config())
+    assert learner.policy is learner.actor
+
+
+@pytest.mark.parametrize("averaging", [0.0, 0.9])
+def test_a_loaded_policy_acts_as_the_trained_one(tmp_path, small_config, averaging):
+    config = small_config(steps=6, algorithm={"averaging": averaging})
+    tmp_path.joinpath("run").mkdir()
+    training = TrainingRun(config, tmp_path / "run")
+    training.run()
+    from equirl.training.folder import prepare_folder
+
+    prepare_folder(tmp_path / "run", config)
+    _, policy = load_policy(tmp_path / "run")
+    data = batch()
+    with torch.no_grad():
+        expected = training.learner.policy(data.select("depth", "holding"))
+        loaded = policy(data.select("depth", "holding"))
+    assert torch.equal(loaded["action"], expected["action"])
+
+
+def test_train_returns_the_evaluation_it_reports(tmp_path, small_config):
+    evaluation = train(small_config(steps=4), tmp_path / "run")
+    assert evaluation is not None and len(evaluation.episodes) == 2
+    report = (tmp_path / "run" / "report.md").read_text()
+    assert f"**{evaluation.success_rate:.0%} success** on 2 held-out scenes" in report
