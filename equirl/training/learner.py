@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from torch.optim.lr_scheduler import LambdaLR
 from torch.optim.swa_utils import AveragedModel
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import SoftUpdate
@@ -64,6 +65,11 @@ class Learner:
         self.optimizer = torch.optim.Adam(
             self.loss.parameters(), lr=algorithm.learning_rate, fused=True
         )
+        falling = algorithm.decay * config.steps  # updates of the falling learning rate
+        self.schedule = LambdaLR(
+            self.optimizer,
+            lambda update: min(1.0, (config.steps - update) / falling) if falling else 1.0,
+        )
 
     @property
     def policy(self) -> ProbabilisticActor:
@@ -83,6 +89,7 @@ class Learner:
         self.optimizer.zero_grad(set_to_none=True)
         (losses["loss_actor"] + losses["loss_qvalue"] + losses["loss_alpha"]).backward()
         self.optimizer.step()
+        self.schedule.step()
         self.target_update.step()
         if self.average is not None:
             self.average.update_parameters(self.actor)
@@ -90,8 +97,12 @@ class Learner:
         return metrics | {"td_error": batch["td_error"].mean().item()}
 
     def state_dict(self) -> dict[str, Any]:
-        """Networks, targets, temperature, optimiser and average."""
-        state = {"loss": self.loss.state_dict(), "optimizer": self.optimizer.state_dict()}
+        """Networks, targets, temperature, optimiser and its schedule, average."""
+        state = {
+            "loss": self.loss.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "updates": self.schedule.last_epoch,
+        }
         if self.average is not None:
             state["average"] = self.average.state_dict()
         return state
@@ -100,6 +111,7 @@ class Learner:
         """Restores what :meth:`state_dict` returned."""
         self.loss.load_state_dict(state["loss"])
         self.optimizer.load_state_dict(state["optimizer"])
+        self.schedule.last_epoch = state["updates"]
         if self.average is not None:
             self.average.load_state_dict(state["average"])
 

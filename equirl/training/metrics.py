@@ -73,6 +73,7 @@ def _trackers(folder: Path, config: Config) -> list[Any]:
 
         trackers.append(TensorboardLogger("tensorboard", log_dir=str(folder)))
     if config.logging.wandb:
+        import wandb
         from torchrl.record.loggers.wandb import WandbLogger
 
         trackers.append(
@@ -82,6 +83,7 @@ def _trackers(folder: Path, config: Config) -> list[Any]:
                 save_dir=str(folder),
                 project=config.logging.wandb_project,
                 config=flatten(config),
+                settings=wandb.Settings(silent=True),
             )
         )
     return trackers

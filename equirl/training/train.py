@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 
@@ -45,7 +46,7 @@ def train(config: Config, folder: Path) -> Evaluation | None:
         if config.evaluation.video_episodes:
             count = config.evaluation.video_episodes
             seeds = [scene_seed(config.seed, Purpose.TEST, index) for index in range(count)]
-            with make_run_env(config) as env:
+            with closing(make_run_env(config)) as env:
                 video = film_policy(env, run.learner.policy, seeds, folder / "policy.mp4")
         write_report(folder, config, evaluation, video=video)
     return evaluation

@@ -44,9 +44,11 @@ def assert_same_run(first, second):
         assert (first / table).read_bytes() == (second / table).read_bytes(), table
 
 
-@pytest.mark.parametrize(("stops", "averaging"), [((7,), 0.0), ((10, 17), 0.9)])
-def test_interrupted_run_equals_uninterrupted(tmp_path, small_config, stops, averaging):
-    config = small_config(algorithm={"averaging": averaging})
+@pytest.mark.parametrize(
+    ("stops", "options"), [((7,), {}), ((10, 17), {"averaging": 0.9, "decay": 0.5})]
+)
+def test_interrupted_run_equals_uninterrupted(tmp_path, small_config, stops, options):
+    config = small_config(algorithm=options)
     run(config, tmp_path / "whole")
     for stop in stops:
         stopped = run(config, tmp_path / "parts", stop_after=stop)
@@ -88,6 +90,12 @@ def test_checkpoint_of_another_configuration_is_refused(tmp_path, small_config):
     run(small_config(), tmp_path / "a", stop_after=3)
     with pytest.raises(CheckpointError, match=r"group is C4 there and D4 here"):
         run(small_config(group="D4"), tmp_path / "a")
+
+
+def test_a_run_whose_schedule_ends_at_its_last_step_is_not_prolonged(tmp_path, small_config):
+    run(small_config(steps=6, algorithm={"decay": 0.5}), tmp_path / "a")
+    with pytest.raises(CheckpointError, match="steps is 6 there and 12 here"):
+        run(small_config(steps=12, algorithm={"decay": 0.5}), tmp_path / "a")
 
 
 def test_damaged_checkpoint_is_named(tmp_path, small_config):
