@@ -32,6 +32,7 @@ class MethodConfig:
 
     name: str = MISSING  # "equivariant" or "cnn"
     hidden: int = 64  # width n of the encoder (appendix A); the CNN scales with it
+    head_width: int = 0  # fields of an equivariant critic head; 0: hidden, as in the paper
 
 
 @dataclass
@@ -41,7 +42,7 @@ class AlgorithmConfig:
     name: str = MISSING  # "sac"
     learning_rate: float = 1e-3
     batch_size: int = 64
-    discount: float = 0.99
+    discount: float = 0.99  # of the learner
     tau: float = 1e-2  # share of the critic that moves into its target each update
     alpha: float = 1e-2  # initial temperature
     target_entropy: float = -5.0
@@ -79,6 +80,7 @@ class EvaluationConfig:
     every: int = 200  # training steps between evaluations; 0: only after training
     episodes: int = 20  # validation scenes an evaluation
     final_episodes: int = 100  # test scenes after training
+    discount: float = 0.99  # of the returns reported, the paper's
     video_episodes: int = 3  # episodes of the learned policy filmed after training; 0: no video
 
 
@@ -188,6 +190,7 @@ def validate(config: Config) -> Config:
             f"method.hidden={config.method.hidden}: expected a multiple of {multiple} "
             f"for images of {config.env.image_size} pixels"
         )
+    at_least("method.head_width", config.method.head_width, 0)
     at_least("env.max_steps", config.env.max_steps, 1)
     at_least("algorithm.batch_size", config.algorithm.batch_size, 1)
     at_least("augmentation.copies", config.augmentation.copies, 0)
@@ -204,6 +207,7 @@ def validate(config: Config) -> Config:
     at_least("threads", config.threads, 0)
     within("algorithm.learning_rate", config.algorithm.learning_rate, 0, 1)
     within("algorithm.discount", config.algorithm.discount, 0, 1)
+    within("evaluation.discount", config.evaluation.discount, 0, 1)
     within("algorithm.tau", config.algorithm.tau, 0, 1)
     share("algorithm.decay", config.algorithm.decay)
     share("algorithm.averaging", config.algorithm.averaging)

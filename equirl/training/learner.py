@@ -34,7 +34,8 @@ def make_networks(config: Config) -> tuple[ProbabilisticActor, torch.nn.Module]:
     if config.method.name == "cnn":
         return make_cnn_actor(**size), make_cnn_critic(**size)
     size["mode"] = config.mode
-    return make_actor(config.group, **size), make_critic(config.group, **size)
+    actor = make_actor(config.group, **size)
+    return actor, make_critic(config.group, head_width=config.method.head_width or None, **size)
 
 
 class Learner:
@@ -119,7 +120,9 @@ class Learner:
 def _average(actor: ProbabilisticActor, decay: float) -> AveragedModel:
     """An exponential moving average of the actor, a plain mean while it is young."""
 
-    def move(average: torch.Tensor, current: torch.Tensor, count: torch.Tensor) -> torch.Tensor:
+    def move(
+        average: torch.Tensor, current: torch.Tensor, count: torch.Tensor | int
+    ) -> torch.Tensor:
         return torch.lerp(average, current, max(1 - decay, 1 / (int(count) + 1)))
 
     return AveragedModel(actor, avg_fn=move)

@@ -76,7 +76,7 @@ class TrainingRun:
             self.env,
             self.learner.actor,
             partial(scene_seed, config.seed, Purpose.TRAINING),
-            discount=config.algorithm.discount,
+            discount=config.evaluation.discount,
         )
         self.log = MetricsLog(folder, config)
         self.clock = Stopwatch()
@@ -195,7 +195,7 @@ class TrainingRun:
                 self.evaluation_env,
                 self.learner.policy,
                 seeds,
-                discount=self.config.algorithm.discount,
+                discount=self.config.evaluation.discount,
             )
 
     def _progress(self) -> AbstractContextManager[Any]:

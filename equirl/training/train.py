@@ -55,7 +55,7 @@ def train(config: Config, folder: Path) -> Evaluation | None:
 def write_episodes(evaluation: Evaluation, path: Path) -> None:
     """Writes one row an episode of an evaluation."""
     with open(path, "w", newline="") as file:
-        rows = [asdict(episode) for episode in evaluation.episodes]
+        rows = [{**asdict(e), "success": int(e.success)} for e in evaluation.episodes]
         writer = csv.DictWriter(file, fieldnames=list(rows[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)

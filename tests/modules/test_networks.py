@@ -285,3 +285,22 @@ def test_import_needs_no_simulator():
     )
     environment = os.environ | {"RL_LOGGING_LEVEL": "ERROR"}
     subprocess.run([sys.executable, "-c", code], check=True, env=environment)
+
+
+def test_wider_heads_leave_the_encoder_alone_and_values_invariant():
+    generator = torch.Generator().manual_seed(0)
+    critic = make_critic("D4", hidden=8, image_size=16, head_width=24, generator=generator)
+    assert count(critic[0]) == count(make_critic("D4", hidden=8, image_size=16)[0])
+    assert critic[1].module.hidden.out_type.size == 2 * 24 * 8
+    critic = critic.double()
+    depth = torch.rand(3, 1, 16, 16, dtype=torch.float64, generator=generator)
+    action = torch.rand(3, 5, dtype=torch.float64, generator=generator) - 0.5
+    data = TensorDict({"depth": depth, "holding": torch.zeros(3, 1).double(), "action": action}, 3)
+    turned = data.clone()
+    turned["depth"] = depth.rot90(1, (-2, -1)).flip(-1)
+    # A quarter turn (x, y) -> (-y, x), then y -> -y, which reverses theta.
+    turned["action"] = action[:, [0, 2, 1, 3, 4]] * torch.tensor([1, -1, -1, 1, -1])
+    values = [critic(x)["state_action_value"] for x in (data, turned)]
+    torch.testing.assert_close(values[0], values[1], atol=1e-9, rtol=0)
+    with pytest.raises(ValueError, match="head width=0"):
+        make_critic("D4", hidden=8, image_size=16, head_width=0)
