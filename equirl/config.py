@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+import os
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
 from omegaconf import MISSING, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 __all__ = ["Config", "ConfigError", "load_config", "register", "save_config", "to_config"]
 
@@ -117,12 +120,8 @@ class Config:
 
     @property
     def torch_device(self) -> str:
-        """The device, ``"auto"`` resolved."""
-        if self.device != "auto":
-            return self.device
-        import torch
-
-        return "cuda:0" if torch.cuda.is_available() else "cpu"
+        """The device, ``"auto"`` resolved; a ConfigError if this machine has none such."""
+        return _available_device(self.device)
 
     @property
     def copies(self) -> int:
@@ -145,6 +144,7 @@ class EvaluateJob:
     run: str = MISSING  # the folder of a run
     episodes: int = 100
     first: int = 0  # number of the first test scene
+    device: str = "auto"
     video: str = ""  # MP4 file to film the first episodes into
     video_episodes: int = 3
 
@@ -155,6 +155,8 @@ def validate(config: Config) -> Config:
     Raises:
         ConfigError: Names the first key whose value no run can have, and what it takes.
     """
+    from equirl.envs.tasks import TASKS
+    from equirl.modules.layout import check_sizes
     from equirl.symmetry import SymmetryGroup
 
     def choice(key: str, value: object, *allowed: object) -> None:
@@ -178,18 +180,16 @@ def validate(config: Config) -> Config:
     except ValueError as error:
         raise ConfigError(f"group={config.group}: {error}") from None
     choice("mode", config.mode, "strict", "paper")
+    choice("env.task", config.env.task, *TASKS)
     choice("env.robot", config.env.robot, "panda", "hand")
     choice("method", config.method.name, "equivariant", "cnn")
     choice("algorithm", config.algorithm.name, "sac")
     choice("augmentation", config.augmentation.name, "buffer", "none")
     choice("logging.wandb_mode", config.logging.wandb_mode, "offline", "online")
-    choice("env.image_size", config.env.image_size, 16, 32, 64, 128, 256)
-    multiple = 16 if config.env.image_size == 256 else 8
-    if config.method.hidden < multiple or config.method.hidden % multiple:
-        raise ConfigError(
-            f"method.hidden={config.method.hidden}: expected a multiple of {multiple} "
-            f"for images of {config.env.image_size} pixels"
-        )
+    try:
+        check_sizes(config.method.hidden, config.env.image_size)
+    except ValueError as error:
+        raise ConfigError(f"method.hidden or env.image_size: {error}") from None
     at_least("method.head_width", config.method.head_width, 0)
     at_least("env.max_steps", config.env.max_steps, 1)
     at_least("algorithm.batch_size", config.algorithm.batch_size, 1)
@@ -197,6 +197,15 @@ def validate(config: Config) -> Config:
     at_least("demos.episodes", config.demos.episodes, 0)
     at_least("replay.start", config.replay.start, 1)
     at_least("replay.capacity", config.replay.capacity, config.copies + 1)
+    if config.replay.start > config.replay.capacity - config.replay.capacity % (config.copies + 1):
+        raise ConfigError(
+            f"replay.start={config.replay.start}: the buffer of {config.replay.capacity} "
+            "transitions never holds so many"
+        )
+    if not math.isfinite(config.algorithm.target_entropy):
+        raise ConfigError(
+            f"algorithm.target_entropy={config.algorithm.target_entropy}: expected a finite number"
+        )
     at_least("evaluation.every", config.evaluation.every, 0)
     at_least("evaluation.episodes", config.evaluation.episodes, 1)
     at_least("evaluation.final_episodes", config.evaluation.final_episodes, 1)
@@ -211,24 +220,31 @@ def validate(config: Config) -> Config:
     within("algorithm.tau", config.algorithm.tau, 0, 1)
     share("algorithm.decay", config.algorithm.decay)
     share("algorithm.averaging", config.algorithm.averaging)
-    within("algorithm.alpha", config.algorithm.alpha, 0, float("inf"))
-    _validate_device(config.device)
+    within("algorithm.alpha", config.algorithm.alpha, 0, 1e6)
     return config
 
 
-def _validate_device(device: str) -> None:
-    if device in ("auto", "cpu"):
-        return
+def _validate_evaluation(job: EvaluateJob) -> EvaluateJob:
+    for key, lowest in (("episodes", 1), ("first", 0), ("video_episodes", 1)):
+        if getattr(job, key) < lowest:
+            raise ConfigError(f"{key}={getattr(job, key)}: expected {lowest} or more")
+    return job
+
+
+def _available_device(device: str) -> str:
     import torch
 
+    if device == "auto":
+        return "cuda:0" if torch.cuda.is_available() else "cpu"
     try:
         parsed = torch.device(device)
     except RuntimeError:
         parsed = None
-    if parsed is None or parsed.type != "cuda":
+    if parsed is None or parsed.type not in ("cpu", "cuda"):
         raise ConfigError(f"device={device}: expected auto, cpu or cuda:<i>")
-    if (parsed.index or 0) >= torch.cuda.device_count():
+    if parsed.type == "cuda" and (parsed.index or 0) >= torch.cuda.device_count():
         raise ConfigError(f"device={device}: this machine has {torch.cuda.device_count()} GPUs")
+    return device
 
 
 def to_config(values: Any, schema: type[Config] = Config) -> Any:
@@ -242,12 +258,22 @@ def to_config(values: Any, schema: type[Config] = Config) -> Any:
         config = OmegaConf.to_object(merged)
     except OmegaConfBaseException as error:
         raise ConfigError(str(error).splitlines()[0] + f" (key {error.full_key})") from None
-    return validate(config) if isinstance(config, Config) else config
+    if isinstance(config, EvaluateJob):
+        return _validate_evaluation(config)
+    assert isinstance(config, Config)
+    return validate(config)
 
 
 def save_config(config: Config, path: Path) -> None:
     """Writes the configuration as YAML."""
-    path.write_text(OmegaConf.to_yaml(OmegaConf.structured(config)))
+    write_atomically(path, OmegaConf.to_yaml(OmegaConf.structured(config)))
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Replaces a file's text; an interruption leaves the old text or the new."""
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text)
+    os.replace(partial, path)
 
 
 def load_config(path: Path) -> Config:
@@ -260,6 +286,8 @@ def load_config(path: Path) -> Config:
         values = OmegaConf.load(path)
     except FileNotFoundError:
         raise ConfigError(f"{path} not found: not the folder of a run") from None
+    except (OSError, YAMLError) as error:
+        raise ConfigError(f"{path} is not a readable configuration: {error}") from None
     return to_config(values)
 
 

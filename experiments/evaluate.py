@@ -34,17 +34,22 @@ def main(values: DictConfig) -> None:
 
     try:
         job = to_config(values, EvaluateJob)
-        config, policy = load_policy(Path(job.run))
+        config, policy = load_policy(Path(job.run), job.device)
     except (ConfigError, CheckpointError) as error:
         sys.exit(f"error: {error}")
+    device = config.torch_device
     seeds = [
         scene_seed(config.seed, Purpose.TEST, job.first + index) for index in range(job.episodes)
     ]
     env = make_run_env(config)
     with tqdm(total=len(seeds), unit="episode", leave=False) as bar:
-        print(evaluate(env, policy, seeds, on_episode=lambda _: bar.update(1)))
+        print(evaluate(env, policy, seeds, device=device, on_episode=lambda _: bar.update(1)))
     if job.video:
-        print(f"video: {film_policy(env, policy, seeds[: job.video_episodes], Path(job.video))}")
+        try:
+            film_policy(env, policy, seeds[: job.video_episodes], Path(job.video), device=device)
+        except OSError as error:
+            sys.exit(f"error: cannot write video={job.video}: {error}")
+        print(f"video: {job.video}")
     env.close()
 
 

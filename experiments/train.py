@@ -7,6 +7,7 @@ python experiments/train.py resume=outputs/my_run
 
 from __future__ import annotations
 
+import os
 import sys
 from datetime import datetime
 from pathlib import Path
@@ -14,49 +15,71 @@ from pathlib import Path
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
-from equirl.config import Config, ConfigError, TrainJob, register, to_config
+from equirl.config import Config, ConfigError, TrainJob, load_config, register, to_config
 
+os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL logs to the standard output
 register()
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="config")
 def main(values: DictConfig) -> None:
     """Runs one training job; a problem the user can mend ends in one sentence."""
+    from equirl.collectors import DemonstrationError
     from equirl.training import CheckpointError, FolderError, train
 
+    multirun = HydraConfig.get().mode == RunMode.MULTIRUN
+    folder = None
     try:
-        config, folder = _job(values)
+        config, folder = _job(values, multirun)
         print(f"run folder: {folder}", flush=True)
         outcome = train(config, folder)
-    except (ConfigError, FolderError, CheckpointError) as error:
-        sys.exit(f"error: {error}")
+    except (ConfigError, FolderError, CheckpointError, DemonstrationError) as error:
+        print(f"error: {error}", file=sys.stderr, flush=True)
+        if multirun:  # Hydra goes on with the other jobs and fails at the end
+            raise
+        sys.exit(1)
+    except KeyboardInterrupt:
+        outcome = None
     if outcome is None:
-        sys.exit(f"stopped; go on with: python experiments/train.py resume={folder}")
+        hint = f"; go on with: python experiments/train.py 'resume=\"{folder}\"'" if folder else ""
+        print(f"stopped{hint}", file=sys.stderr)
+        sys.exit(130)
     print(outcome)
     print(f"report: {folder / 'report.md'}")
 
 
-def _job(values: DictConfig) -> tuple[Config, Path]:
+def _job(values: DictConfig, multirun: bool) -> tuple[Config, Path]:
     """The run and its folder, from the composed command line."""
-    from equirl.training import load_run_config
-
     job = to_config(values, TrainJob)
-    hydra_config = HydraConfig.get()
+    if multirun and (job.output or job.resume):
+        raise ConfigError("output= and resume= name one run; a multirun makes a folder for each")
     if job.resume:
-        others = [text for text in hydra_config.overrides.task if not text.startswith("resume=")]
-        if others:
-            raise ConfigError(f"resume= takes no other keys, got {' '.join(others)}")
-        return load_run_config(Path(job.resume)), Path(job.resume)
+        return _resumed(Path(job.resume)), Path(job.resume)
     config = Config(**{name: getattr(job, name) for name in Config.__dataclass_fields__})
     if job.output:
         folder = Path(job.output)
-    elif hydra_config.mode == RunMode.MULTIRUN:
-        folder = Path(hydra_config.runtime.output_dir)
+    elif multirun:
+        folder = Path(HydraConfig.get().runtime.output_dir)
     else:
-        folder = Path("outputs", config.env.task, f"{datetime.now():%Y-%m-%d_%H-%M-%S}")
+        name = f"{datetime.now():%Y-%m-%d_%H-%M-%S}_seed{config.seed}"
+        folder = Path("outputs", config.env.task, name)
     return config, folder
+
+
+def _resumed(folder: Path) -> Config:
+    """The configuration of an interrupted run, with what may be changed on the way."""
+    changes = [text for text in HydraConfig.get().overrides.task if not text.startswith("resume=")]
+    free = ("steps=", "device=", "threads=", "checkpoint_every=", "logging.", "evaluation.")
+    for text in changes:
+        if not text.startswith(free):
+            raise ConfigError(
+                f"{text}: a run is resumed with its own configuration; "
+                f"only {', '.join(key.rstrip('=') for key in free)} may change"
+            )
+    config = load_config(folder / "config.yaml")
+    return to_config(OmegaConf.merge(OmegaConf.structured(config), OmegaConf.from_dotlist(changes)))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,20 @@
 """The configuration schema."""
 
-import pytest
+from pathlib import Path
 
-from equirl.config import Config, ConfigError, flatten, load_config, save_config, to_config
+import pytest
+from hydra import compose, initialize_config_dir
+
+from equirl.config import (
+    Config,
+    ConfigError,
+    TrainJob,
+    flatten,
+    load_config,
+    register,
+    save_config,
+    to_config,
+)
 
 GOOD = {
     "env": {"task": "block_picking"},
@@ -44,19 +56,52 @@ def test_group_is_normalised():
         ({"method": {"name": "ferm"}}, "method=ferm: expected one of equivariant, cnn"),
         ({"algorithm": {"name": "sacfd"}}, "algorithm=sacfd: expected one of sac"),
         ({"augmentation": {"name": "online"}}, "augmentation=online"),
+        ({"env": {"task": "block_stacking"}}, "env.task=block_stacking: expected one of block_pi"),
         ({"env": {"task": "block_picking", "image_size": 48}}, "image_size=48.*16, 32, 64"),
         ({"env": {"task": "block_picking", "robot": "ur5"}}, "robot=ur5: expected one of panda"),
-        ({"method": {"name": "equivariant", "hidden": 12}}, "hidden=12: expected a multiple of 8"),
+        ({"method": {"name": "equivariant", "hidden": 12}}, "hidden=12.*multiple of 8"),
         ({"algorithm": {"name": "sac", "tau": 0.0}}, "algorithm.tau=0.0"),
         ({"replay": {"capacity": 3}}, "replay.capacity=3: expected 5 or more"),
-        ({"device": "tpu"}, "device=tpu: expected auto, cpu or cuda"),
-        ({"device": "cuda:99"}, "device=cuda:99: this machine has"),
+        ({"replay": {"start": 200_000}}, "replay.start=200000: the buffer of 100000 transitions"),
+        ({"algorithm": {"name": "sac", "alpha": float("inf")}}, "algorithm.alpha=inf"),
+        ({"algorithm": {"name": "sac", "target_entropy": float("nan")}}, "target_entropy=nan"),
+        ({"algorithm": {"name": "sac", "averaging": 1.0}}, "algorithm.averaging=1.0"),
         ({"steps": 0}, "steps=0"),
     ],
 )
 def test_impossible_values_are_named(changes, message):
     with pytest.raises(ConfigError, match=message):
         to_config(GOOD | changes)
+
+
+@pytest.mark.parametrize("device", ["tpu", "cuda:99", "meta"])
+def test_a_missing_device_is_named_where_it_is_used(device):
+    config = to_config(GOOD | {"device": device})  # a run can be read where it cannot be trained
+    with pytest.raises(ConfigError, match=f"device={device}"):
+        _ = config.torch_device
+
+
+@pytest.mark.parametrize("preset", ["laptop", "paper", "smoke"])
+def test_presets_compose_into_valid_configurations(preset):
+    register()
+    root = Path(__file__).parents[1] / "conf"
+    with initialize_config_dir(str(root), version_base="1.3"):
+        config = to_config(compose("config", [f"preset={preset}"]), TrainJob)
+    if preset == "paper":
+        assert (config.mode, config.env.image_size, config.method.hidden) == ("paper", 128, 64)
+        learner = config.algorithm
+        assert (learner.learning_rate, learner.batch_size, learner.discount) == (1e-3, 64, 0.99)
+        assert (learner.tau, learner.alpha, learner.target_entropy) == (1e-2, 1e-2, -5)
+        assert (learner.decay, learner.averaging, config.method.head_width) == (0, 0, 0)
+        assert (config.steps, config.copies, config.demos.episodes) == (10_000, 4, 20)
+    else:
+        assert config.mode == "strict"
+
+
+def test_a_file_that_is_not_yaml_is_named(tmp_path):
+    (tmp_path / "config.yaml").write_text("env: [")
+    with pytest.raises(ConfigError, match="not a readable configuration"):
+        load_config(tmp_path / "config.yaml")
 
 
 def test_a_folder_without_a_run_is_named(tmp_path):

@@ -1,5 +1,6 @@
 """Collectors of experience."""
 
-from equirl.collectors.demonstrations import DemonstrationCollector
+from .demonstrations import DemonstrationCollector, DemonstrationError
+from .online import Episode, OnlineCollector
 
-__all__ = ["DemonstrationCollector"]
+__all__ = ["DemonstrationCollector", "DemonstrationError", "Episode", "OnlineCollector"]

@@ -16,6 +16,10 @@ _OBSERVED = ("depth", "holding")
 _NEXT = (*_OBSERVED, "reward", "done", "terminated", "truncated")
 
 
+class DemonstrationError(RuntimeError):
+    """The expert does not solve the environment it was given."""
+
+
 class DemonstrationCollector(BaseCollector):
     """Yields successful episodes of an expert, one TensorDict each; failed ones are discarded.
 
@@ -37,6 +41,8 @@ class DemonstrationCollector(BaseCollector):
         policy: writes ``action``. Defaults to ``equirl.envs.make_expert(env)``.
         episodes: how many successful episodes to yield in all.
         seed: root of all randomness.
+        seeds: maps the number of an attempt to the seed of its scene, instead of ``seed``; for
+            callers that keep the scenes of several purposes apart.
         replay_buffer: if given, every episode is also written into it by one ``extend``.
         max_failures: consecutive failed attempts that are given up on.
 
@@ -46,7 +52,7 @@ class DemonstrationCollector(BaseCollector):
 
     Raises:
         ValueError: on an argument out of range.
-        RuntimeError: while iterating, after ``max_failures`` failed attempts in a row.
+        DemonstrationError: while iterating, after ``max_failures`` failed attempts in a row.
     """
 
     def __init__(
@@ -55,7 +61,8 @@ class DemonstrationCollector(BaseCollector):
         policy: Callable[[TensorDictBase], TensorDictBase] | None = None,
         *,
         episodes: int,
-        seed: int,
+        seed: int = 0,
+        seeds: Callable[[int], int] | None = None,
         replay_buffer: ReplayBuffer | None = None,
         max_failures: int = 20,
     ):
@@ -75,6 +82,7 @@ class DemonstrationCollector(BaseCollector):
         self.replay_buffer = replay_buffer
         self._episodes = episodes
         self._max_failures = max_failures
+        self._seeds = seeds
         self.closed = False
         self.set_seed(seed)
 
@@ -92,7 +100,7 @@ class DemonstrationCollector(BaseCollector):
             if episode["next", "reward"][-1].item() <= 0:
                 failures += 1
                 if failures >= self._max_failures:
-                    raise RuntimeError(
+                    raise DemonstrationError(
                         f"{type(self.policy).__name__} failed {failures} episodes in a row (found "
                         f"{self.episodes_collected} of {self._episodes} demonstrations in "
                         f"{self.attempted} attempts); is it the expert of this environment?"
@@ -109,9 +117,8 @@ class DemonstrationCollector(BaseCollector):
     @torch.no_grad()
     def _attempt(self) -> TensorDictBase:
         """Runs the next attempt and returns its transitions, shape [T]."""
-        root = np.random.SeedSequence(self._seed, spawn_key=(self.attempted,))
+        self.env.set_seed(self._scene_seed(self.attempted), static_seed=True)
         self.attempted += 1
-        self.env.set_seed(int(root.generate_state(1)[0]))
         transitions = []
         current, done = self.env.reset(), False
         while not done:
@@ -119,6 +126,12 @@ class DemonstrationCollector(BaseCollector):
             transitions.append(self._transition(step))
             current, done = step["next"].exclude("reward"), step["next", "done"].item()
         return torch.stack(transitions)
+
+    def _scene_seed(self, attempt: int) -> int:
+        if self._seeds is not None:
+            return self._seeds(attempt)
+        root = np.random.SeedSequence(self._seed, spawn_key=(attempt,))
+        return int(root.generate_state(1)[0])
 
     @staticmethod
     def _transition(step: TensorDictBase) -> TensorDict:

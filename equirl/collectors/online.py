@@ -23,7 +23,7 @@ class Episode:
 
     index: int
     length: int
-    rewards: float  # undiscounted return
+    undiscounted: float  # return
     discounted: float  # discounted return
     success: bool
 
@@ -40,6 +40,7 @@ class OnlineCollector:
         policy: The behaviour policy; sampled, not greedy.
         seeds: Maps the number of an episode to the seed of its scene.
         discount: For the discounted return reported for each episode.
+        device: Where the policy lives; the environment stays on the CPU.
     """
 
     def __init__(
@@ -49,11 +50,13 @@ class OnlineCollector:
         seeds: Callable[[int], int],
         *,
         discount: float = 0.99,
+        device: torch.device | str = "cpu",
     ):
         self.env = env
         self.policy = policy
         self.seeds = seeds
         self.discount = discount
+        self.device = device
         self.episode = 0
         self._actions: list[torch.Tensor] = []
         self._rewards: list[float] = []
@@ -68,7 +71,7 @@ class OnlineCollector:
         if self._current is None:
             self._current = self._begin()
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-            return self.policy(self._current.copy())
+            return self.policy(self._current.copy().to(self.device))
 
     def step(self, acted: TensorDictBase) -> tuple[TensorDict, Episode | None]:
         """Takes the chosen action.
@@ -118,7 +121,7 @@ class OnlineCollector:
         summary = Episode(
             index=self.episode,
             length=len(rewards),
-            rewards=sum(rewards),
+            undiscounted=sum(rewards),
             discounted=sum(r * self.discount**t for t, r in enumerate(rewards)),
             success=rewards[-1] > 0,
         )

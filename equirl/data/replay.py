@@ -20,6 +20,7 @@ def make_replay_buffer(
     *,
     copies: int = 4,
     batch_size: int = 64,
+    max_depth: float = 0.32,
     device: torch.device | str = "cpu",
     generator: torch.Generator | None = None,
 ) -> TensorDictReplayBuffer:
@@ -29,6 +30,7 @@ def make_replay_buffer(
         capacity: Transitions held, augmented copies counted.
         copies: Rotated copies of each transition; 0 switches the augmentation off.
         batch_size: Transitions a call of ``sample()`` returns.
+        max_depth: Largest depth observed, in m; it sets the storage's resolution.
         device: Where sampled batches live; the storage stays in main memory.
         generator: Source of all of the buffer's randomness (which rows, which copies,
             which angles), a CPU generator.
@@ -51,7 +53,7 @@ def make_replay_buffer(
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(rows),
         sampler=RandomSampler(),
-        transform=Compose(QuantizeDepth(), augmentation),
+        transform=Compose(QuantizeDepth(max_depth), augmentation),
         batch_size=batch_size,
         generator=generator,
     )

@@ -78,11 +78,14 @@ def expanded_filter(owner: object, weights: Tensor, expand: Callable[[Tensor], T
     key = (id(owner), address, weights.dtype, weights.device, torch.is_inference_mode_enabled())
     needs_grad = weights.requires_grad and torch.is_grad_enabled()
     entry = cache.get(key)
-    if entry is not None and _serves(entry, weights, needs_grad):
-        return entry.filter if needs_grad else entry.filter.detach()
-    filter = expand(weights)
-    cache[key] = _Entry(weights, weights.detach().clone(), filter)
-    return filter
+    if entry is None or not _serves(entry, weights, needs_grad):
+        # With its graph even where this pass needs none, so that a later one can use it.
+        with torch.set_grad_enabled(
+            weights.requires_grad and not torch.is_inference_mode_enabled()
+        ):
+            entry = _Entry(weights, weights.detach().clone(), expand(weights))
+        cache[key] = entry
+    return entry.filter if needs_grad else entry.filter.detach()
 
 
 def _serves(entry: _Entry, weights: Tensor, needs_grad: bool) -> bool:

@@ -66,6 +66,7 @@ def play(
     seed: int,
     *,
     discount: float = 0.99,
+    device: torch.device | str = "cpu",
     on_step: Callable[[torch.Tensor], None] | None = None,
 ) -> EpisodeResult:
     """Plays one greedy episode.
@@ -75,6 +76,7 @@ def play(
         policy: Acts deterministically; no random number is drawn.
         seed: The scene.
         discount: For the discounted return.
+        device: Where the policy lives.
         on_step: Called with each observation's depth image, the first included.
     """
     env.set_seed(seed, static_seed=True)
@@ -84,7 +86,7 @@ def play(
         while True:
             if on_step:
                 on_step(current["depth"])
-            action = policy(current.copy())["action"].cpu()
+            action = policy(current.copy().to(device))["action"].cpu()
             stepped = env.step(current.set("action", action))
             rewards.append(stepped["next", "reward"].item())
             current = step_mdp(stepped)
@@ -106,6 +108,7 @@ def evaluate(
     seeds: Sequence[int],
     *,
     discount: float = 0.99,
+    device: torch.device | str = "cpu",
     on_episode: Callable[[EpisodeResult], None] | None = None,
 ) -> Evaluation:
     """Plays one greedy episode for each seed.
@@ -115,12 +118,13 @@ def evaluate(
         policy: Acts deterministically.
         seeds: The scenes.
         discount: For the discounted returns.
+        device: Where the policy lives.
         on_episode: Called after each episode, for progress.
     """
     results = []
     with shared_filters():
         for seed in seeds:
-            results.append(play(env, policy, seed, discount=discount))
+            results.append(play(env, policy, seed, discount=discount, device=device))
             if on_episode:
                 on_episode(results[-1])
     return Evaluation(tuple(results))

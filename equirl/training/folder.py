@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import fcntl
 import signal
+import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,6 +26,7 @@ __all__ = [
 ]
 
 CONFIG = "config.yaml"
+LOCK = ".lock"
 CHECKPOINT = "checkpoint.pt"
 
 
@@ -32,19 +35,21 @@ class FolderError(RuntimeError):
 
 
 def prepare_folder(folder: Path, config: Config) -> None:
-    """Makes the run's folder and writes the configuration into it.
+    """Writes the configuration into the run's folder, unless it is there already.
 
     Raises:
-        FolderError: The folder cannot be made or written.
+        FolderError: The folder holds files of something else.
         CheckpointError: It holds the checkpoint of a run of another configuration.
     """
-    if (folder / CONFIG).exists() and (folder / CHECKPOINT).exists():
+    others = {path.name for path in folder.iterdir()} - {LOCK}
+    if (folder / CHECKPOINT).exists() and (folder / CONFIG).exists():
         check_same_config(flatten(config), flatten(load_run_config(folder)), folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        save_config(config, folder / CONFIG)
-    except OSError as error:
-        raise FolderError(f"cannot write to the run's folder {folder}: {error}") from error
+    elif others and CONFIG not in others:
+        raise FolderError(
+            f"{folder} is not empty and not the folder of a run (it holds {sorted(others)[0]}); "
+            "choose another"
+        )
+    save_config(config, folder / CONFIG)
 
 
 def load_run_config(folder: Path) -> Config:
@@ -58,17 +63,30 @@ def load_run_config(folder: Path) -> Config:
 
 @contextmanager
 def claim_folder(folder: Path) -> Iterator[None]:
-    """Keeps a second process from training into the same folder.
+    """Makes the folder and keeps a second process from training into it.
 
-    The claim ends with the process, however that ends.
+    The claim ends with the process, however that ends. Trouble with the disk inside the
+    context becomes a FolderError too.
 
     Raises:
-        FolderError: Another run is using the folder.
+        FolderError: Another run is using the folder, or it cannot be written.
     """
-    with open(folder / ".lock", "w") as lock:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with _locked(folder):
+            yield
+    except OSError as error:
+        raise FolderError(
+            f"cannot write to the run's folder {folder}: {error}; what its checkpoint holds is safe"
+        ) from error
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    with open(folder / LOCK, "w") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except BlockingIOError:
             raise FolderError(f"another run is writing to {folder}") from None
         yield
 
@@ -77,16 +95,23 @@ def claim_folder(folder: Path) -> Iterator[None]:
 def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
     """Turns the first Ctrl-C (or a termination request) into a question with answer yes.
 
-    A second Ctrl-C interrupts at once, as usual.
+    A second one interrupts at once, as usual. Outside the main thread, where signals
+    cannot be handled, the answer is always no.
     """
     asked = False
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
 
     def ask(number: int, frame: FrameType | None) -> None:
         nonlocal asked
         asked = True
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        print("\nstopping with a checkpoint; once more stops at once", file=sys.stderr, flush=True)
+        for each in numbers:
+            signal.signal(each, signal.default_int_handler)
 
-    previous = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    previous = {number: signal.signal(number, ask) for number in numbers}
     try:
         yield lambda: asked
     finally:

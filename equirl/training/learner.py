@@ -128,14 +128,19 @@ def _average(actor: ProbabilisticActor, decay: float) -> AveragedModel:
     return AveragedModel(actor, avg_fn=move)
 
 
-def load_policy(folder: Path) -> tuple[Config, ProbabilisticActor]:
+def load_policy(folder: Path, device: str | None = None) -> tuple[Config, ProbabilisticActor]:
     """The trained policy of a run's folder, with the run's configuration.
 
+    Args:
+        folder: The run's folder.
+        device: Where to put the policy; where it was trained when None.
+
     Raises:
-        ConfigError: The folder is not that of a run.
+        ConfigError: The folder is not that of a run, or the device is not there.
         CheckpointError: It holds no readable checkpoint of that configuration.
     """
     config = load_run_config(folder)
+    config.device = device or config.device
     state = load_checkpoint(folder / CHECKPOINT)
     check_same_config(flatten(config), state["config"], folder / CHECKPOINT)
     learner = Learner(config)

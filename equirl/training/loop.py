@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import deque
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -12,13 +13,13 @@ from typing import Any, Literal, cast
 import torch
 from tqdm import tqdm
 
-from equirl.collectors import DemonstrationCollector
-from equirl.collectors.online import Episode, OnlineCollector
+from equirl.collectors import DemonstrationCollector, Episode, OnlineCollector
 from equirl.config import Config, flatten
 from equirl.data import load_replay_state, make_replay_buffer, replay_state
 from equirl.envs import ManipulationEnv, make_env, make_expert
+from equirl.modules import shared_filters
 
-from .checkpoint import check_same_config, load_checkpoint, save_checkpoint
+from .checkpoint import CheckpointError, check_same_config, load_checkpoint, save_checkpoint
 from .evaluation import Evaluation, evaluate
 from .folder import CHECKPOINT
 from .learner import Learner
@@ -27,6 +28,9 @@ from .seeding import Purpose, scene_seed, seed_everything, torch_generator
 from .timing import Stopwatch
 
 __all__ = ["TrainingRun", "make_run_env"]
+
+#: What the run's time is divided into.
+PARTS = ("demonstrations", "act", "environment", "replay", "update", "evaluation", "checkpoint")
 
 
 def make_run_env(config: Config, **options: Any) -> ManipulationEnv:
@@ -57,18 +61,18 @@ class TrainingRun:
     def __init__(
         self, config: Config, folder: Path, should_stop: Callable[[], bool] = lambda: False
     ):
-        if config.threads:
-            torch.set_num_threads(config.threads)
+        torch.set_num_threads(config.threads or os.cpu_count() or 1)
         seed_everything(config.seed)
         self.config, self.folder, self.should_stop = config, folder, should_stop
+        self.learner = Learner(config)
         self.env = make_run_env(config)
         self.evaluation_env = make_run_env(config)
-        self.learner = Learner(config)
         self.generator = torch_generator(config.seed, Purpose.REPLAY)
         self.buffer = make_replay_buffer(
             config.replay.capacity,
             copies=config.copies,
             batch_size=config.algorithm.batch_size,
+            max_depth=self.env.observation_spec["depth"].high.max().item(),
             device=config.torch_device,
             generator=self.generator,
         )
@@ -77,13 +81,15 @@ class TrainingRun:
             self.learner.actor,
             partial(scene_seed, config.seed, Purpose.TRAINING),
             discount=config.evaluation.discount,
+            device=config.torch_device,
         )
         self.log = MetricsLog(folder, config)
-        self.clock = Stopwatch()
+        self.clock = Stopwatch(PARTS)
         self.step = 0
         self._sums: dict[str, float] = {}
         self._updates = 0
         self._recent: deque[Episode] = deque(maxlen=20)
+        self._greedy = ""
 
     def run(self) -> Evaluation | None:
         """Trains to the configured number of steps, then evaluates on the test scenes.
@@ -118,7 +124,7 @@ class TrainingRun:
             self.env,
             make_expert(self.env, horizontal_clip=clip),
             episodes=self.config.demos.episodes,
-            seed=scene_seed(self.config.seed, Purpose.DEMONSTRATIONS),
+            seeds=partial(scene_seed, self.config.seed, Purpose.DEMONSTRATIONS),
             replay_buffer=self.buffer,
         )
         with self.clock.measure("demonstrations"):
@@ -128,19 +134,10 @@ class TrainingRun:
     def _train(self) -> bool:
         """The loop of the paper; True when it reached the last step."""
         config = self.config
-        with self._progress() as bar:
+        with self._training_progress() as bar:
             while self.step < config.steps:
-                with self.clock.measure("act"):
-                    acted = self.collector.act()
-                with self.clock.measure("environment"):
-                    transition, episode = self.collector.step(acted)
-                with self.clock.measure("replay"):
-                    self.buffer.extend(transition)
-                if len(self.buffer) * (config.copies + 1) >= config.replay.start:
-                    with self.clock.measure("replay"):
-                        batch = self.buffer.sample()
-                    with self.clock.measure("update"):
-                        self._accumulate(self.learner.update(batch))
+                with shared_filters():  # the actor's, from acting to the update
+                    episode = self._step()
                 self.step += 1
                 if episode:
                     self._log_episode(episode)
@@ -154,6 +151,21 @@ class TrainingRun:
                     return False
         return True
 
+    def _step(self) -> Episode | None:
+        """One environment step and one update; the episode's summary if it ended."""
+        with self.clock.measure("act"):
+            acted = self.collector.act()
+        with self.clock.measure("environment"):
+            transition, episode = self.collector.step(acted)
+        with self.clock.measure("replay"):
+            self.buffer.extend(transition)
+        if len(self.buffer) * (self.config.copies + 1) >= self.config.replay.start:
+            with self.clock.measure("replay"):
+                batch = self.buffer.sample()
+            with self.clock.measure("update"):
+                self._accumulate(self.learner.update(batch))
+        return episode
+
     def _accumulate(self, metrics: dict[str, float]) -> None:
         self._updates += 1
         for name, value in metrics.items():
@@ -166,7 +178,7 @@ class TrainingRun:
             "episode": episode.index,
             "length": episode.length,
             "success": int(episode.success),
-            "return": episode.rewards,
+            "return": episode.undiscounted,
             "discounted_return": episode.discounted,
         }
         for name in (*self.learner.loss.out_keys, "td_error"):
@@ -176,6 +188,7 @@ class TrainingRun:
 
     def _validate(self) -> None:
         outcome = self._evaluate(Purpose.VALIDATION, self.config.evaluation.episodes)
+        self._greedy = f"{outcome.success_rate:.0%}"
         low, high = outcome.interval
         row = {
             "step": self.step,
@@ -190,15 +203,23 @@ class TrainingRun:
 
     def _evaluate(self, purpose: Purpose, episodes: int) -> Evaluation:
         seeds = [scene_seed(self.config.seed, purpose, index) for index in range(episodes)]
-        with self.clock.measure("evaluation"):
+        with self.clock.measure("evaluation"), self._progress(episodes, purpose) as bar:
             return evaluate(
                 self.evaluation_env,
                 self.learner.policy,
                 seeds,
                 discount=self.config.evaluation.discount,
+                device=self.config.torch_device,
+                on_episode=lambda _: bar.update(1) if bar is not None else None,
             )
 
-    def _progress(self) -> AbstractContextManager[Any]:
+    def _progress(self, episodes: int, purpose: Purpose) -> AbstractContextManager[Any]:
+        if not self.config.logging.progress:
+            return nullcontext()
+        name = f"{purpose.name.lower()} scenes"
+        return tqdm(total=episodes, desc=name, unit="episode", leave=False, dynamic_ncols=True)
+
+    def _training_progress(self) -> AbstractContextManager[Any]:
         if not self.config.logging.progress:
             return nullcontext()
         return tqdm(total=self.config.steps, initial=self.step, unit="step", dynamic_ncols=True)
@@ -208,15 +229,20 @@ class TrainingRun:
             return
         if self._recent:
             count = len(self._recent)
-            bar.set_postfix(
-                ret=f"{sum(e.discounted for e in self._recent) / count:.2f}",
-                success=f"{sum(e.success for e in self._recent) / count:.0%}",
-                update=f"{self.clock.mean('update') * 1e3:.0f}ms",
-                refresh=False,
-            )
+            shown = {
+                "return": f"{sum(e.discounted for e in self._recent) / count:.2f}",
+                "success": f"{sum(e.success for e in self._recent) / count:.0%}",
+                "greedy": self._greedy or "-",
+                "update": f"{self.clock.mean('update') * 1e3:.0f}ms",
+            }
+            bar.set_postfix(shown, refresh=False)
         bar.update(1)
 
     def _save(self) -> None:
+        with self.clock.measure("checkpoint"):
+            self._write_checkpoint()
+
+    def _write_checkpoint(self) -> None:
         save_checkpoint(
             {
                 "config": flatten(self.config),
@@ -230,6 +256,7 @@ class TrainingRun:
                 "clock": self.clock.state_dict(),
                 "replay_rng": self.generator.get_state(),
                 "policy_rng": torch.get_rng_state(),
+                "cuda_rng": self._cuda_rng(),
             },
             self.folder / CHECKPOINT,
         )
@@ -237,6 +264,11 @@ class TrainingRun:
     def _restore(self, state: dict[str, Any]) -> None:
         check_same_config(flatten(self.config), state["config"], self.folder / CHECKPOINT)
         self.step = state["step"]
+        if self.step > self.config.steps:
+            where = self.folder / CHECKPOINT
+            raise CheckpointError(
+                f"{where} is at step {self.step}, beyond steps={self.config.steps}"
+            )
         self.learner.load_state_dict(state["learner"])
         load_replay_state(self.buffer, state["buffer"])
         self.collector.load_state_dict(state["collector"])
@@ -247,3 +279,9 @@ class TrainingRun:
         # Last, since rebuilding the rest may draw random numbers.
         self.generator.set_state(state["replay_rng"])
         torch.set_rng_state(state["policy_rng"])
+        if state["cuda_rng"] is not None and self._cuda_rng() is not None:
+            torch.cuda.set_rng_state(state["cuda_rng"], self.config.torch_device)
+
+    def _cuda_rng(self) -> torch.Tensor | None:
+        device = self.config.torch_device
+        return torch.cuda.get_rng_state(device) if device.startswith("cuda") else None

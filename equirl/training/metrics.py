@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import csv
+import importlib.util
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from equirl.config import Config, flatten
+from equirl.config import Config, ConfigError, flatten, write_atomically
 
 __all__ = ["MetricsLog"]
 
@@ -37,9 +38,9 @@ class MetricsLog:
             path = self.folder / f"{table}.csv"
             if not path.exists():
                 continue
-            lines = path.read_text().splitlines(keepends=True)
-            kept = [line for line in lines[1:] if line.endswith("\n") and _step_of(line) <= step]
-            path.write_text("".join(lines[:1] + kept))
+            lines = [line for line in path.read_text().splitlines(True) if line.endswith("\n")]
+            kept = [line for line in lines[1:] if _step_of(line) <= step]
+            write_atomically(path, "".join(lines[:1] + kept))
 
     def write(self, table: str, row: Row) -> None:
         """Appends one row; its first key must be ``step``."""
@@ -68,6 +69,12 @@ def _step_of(line: str) -> float:
 
 def _trackers(folder: Path, config: Config) -> list[Any]:
     trackers: list[Any] = []
+    for key, package in (("tensorboard", "tensorboard"), ("wandb", "wandb")):
+        if getattr(config.logging, key) and importlib.util.find_spec(package) is None:
+            raise ConfigError(
+                f"logging.{key}=true: the package {package} is not installed; "
+                "it comes with pip install 'equirl[tracking]'"
+            )
     if config.logging.tensorboard:
         from torchrl.record.loggers.tensorboard import TensorboardLogger
 

@@ -40,7 +40,8 @@ def write_report(
         "",
         "| | |",
         "| --- | --- |",
-        f"| mean discounted return | {evaluation.discounted:.3f} |",
+        f"| mean discounted return (discount {config.evaluation.discount}) "
+        f"| {evaluation.discounted:.3f} |",
     ]
     if solved:
         lines.append(f"| mean length of a successful episode | {sum(solved) / len(solved):.1f} |")
@@ -58,9 +59,11 @@ def write_report(
     ]
     if video:
         lines += [f"The learned policy at work: [{video.name}]({video.name}).", ""]
-    failures = [str(episode.seed) for episode in evaluation.episodes if not episode.success]
+    failures = [str(i) for i, episode in enumerate(evaluation.episodes) if not episode.success]
     if failures:
-        lines += [f"Seeds of the scenes it failed: {', '.join(failures)}.", ""]
+        lines += [f"Test scenes it failed, by number: {', '.join(failures)}.", ""]
+    if not timing.get("update_ms", [0.0])[-1]:
+        lines += ["**No update was made**: the replay buffer never held enough.", ""]
     lines += [
         "| file | what |",
         "| --- | --- |",

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 __all__ = ["Stopwatch"]
 
 
 class Stopwatch:
-    """Sums wall-clock seconds and calls under names; survives a resume."""
+    """Sums wall-clock seconds and calls under names; survives a resume.
 
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self.calls: dict[str, int] = {}
+    Args:
+        names: Those to report from the start, measured yet or not.
+    """
+
+    def __init__(self, names: Iterable[str] = ()) -> None:
+        self.seconds: dict[str, float] = dict.fromkeys(names, 0.0)
+        self.calls: dict[str, int] = dict.fromkeys(names, 0)
 
     @contextmanager
     def measure(self, name: str) -> Iterator[None]:

@@ -16,7 +16,10 @@ from .report import write_report
 from .seeding import Purpose, scene_seed
 from .video import film_policy
 
-__all__ = ["train"]
+__all__ = ["train", "write_episodes"]
+
+#: What describes the policy at the end of a run, in the order it is written.
+RESULTS = ("test.csv", "report.md", "curves.png", "policy.mp4")
 
 
 def train(config: Config, folder: Path) -> Evaluation | None:
@@ -31,25 +34,44 @@ def train(config: Config, folder: Path) -> Evaluation | None:
         run; calling again then goes on where it stopped.
 
     Raises:
-        FolderError: The folder cannot be written, or another run is using it.
+        ConfigError: A device or a tracker that this machine does not have.
+        FolderError: The folder cannot be written, holds something else, or another run
+            is using it.
         CheckpointError: The folder holds a run of another configuration, or a
             checkpoint cannot be written or read.
+        DemonstrationError: The expert does not solve the task as configured.
     """
-    prepare_folder(folder, config)
-    with claim_folder(folder), stop_on_interrupt() as should_stop:
-        run = TrainingRun(config, folder, should_stop)
-        evaluation = run.run()
+    with claim_folder(folder):
+        prepare_folder(folder, config)
+        with stop_on_interrupt() as should_stop:
+            run = TrainingRun(config, folder, should_stop)
+            for name in RESULTS:  # those of an earlier end describe another policy
+                (folder / name).unlink(missing_ok=True)
+            evaluation = run.run()
         if evaluation is None:
             return None
         write_episodes(evaluation, folder / "test.csv")
-        video = None
-        if config.evaluation.video_episodes:
-            count = config.evaluation.video_episodes
-            seeds = [scene_seed(config.seed, Purpose.TEST, index) for index in range(count)]
-            with closing(make_run_env(config)) as env:
-                video = film_policy(env, run.learner.policy, seeds, folder / "policy.mp4")
-        write_report(folder, config, evaluation, video=video)
+        write_report(folder, config, evaluation)
+        if config.evaluation.video_episodes and _film(run, folder / "policy.mp4"):
+            write_report(folder, config, evaluation, video=folder / "policy.mp4")
     return evaluation
+
+
+def _film(run: TrainingRun, path: Path) -> bool:
+    """Films the trained policy; a failure costs the film only."""
+    config = run.config
+    seeds = [
+        scene_seed(config.seed, Purpose.TEST, index)
+        for index in range(config.evaluation.video_episodes)
+    ]
+    try:
+        with closing(make_run_env(config)) as env:
+            film_policy(env, run.learner.policy, seeds, path, device=config.torch_device)
+    except (OSError, RuntimeError) as error:
+        print(f"no video: {error}")
+        path.unlink(missing_ok=True)
+        return False
+    return True
 
 
 def write_episodes(evaluation: Evaluation, path: Path) -> None:

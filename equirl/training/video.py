@@ -17,7 +17,6 @@ from .evaluation import play
 __all__ = ["film_policy"]
 
 _SIDE = 384  # pixels of each of the two pictures
-_DEPTH_MAX = 0.32  # metres, the observation's range
 
 
 def film_policy(
@@ -27,6 +26,7 @@ def film_policy(
     path: Path,
     *,
     fps: int = 4,
+    device: torch.device | str = "cpu",
 ) -> Path:
     """Plays greedy episodes and writes them as one MP4, a frame a step.
 
@@ -36,28 +36,31 @@ def film_policy(
         seeds: The scenes.
         path: The file to write.
         fps: Frames a second.
+        device: Where the policy lives.
 
     Returns:
         ``path``.
     """
     import imageio.v2 as imageio
 
+    deepest = env.observation_spec["depth"].high.max().item()
+
     writer: Any = imageio.get_writer(path, fps=fps, macro_block_size=None, quality=7)
     with writer:
 
         def film(depth: torch.Tensor) -> None:
-            writer.append_data(np.hstack([_fit(env.render()), _depth_picture(depth)]))
+            writer.append_data(np.hstack([_fit(env.render()), _depth_picture(depth, deepest)]))
 
         for seed in seeds:
-            play(env, policy, seed, on_step=film)
+            play(env, policy, seed, device=device, on_step=film)
     return path
 
 
-def _depth_picture(depth: torch.Tensor) -> np.ndarray:
-    """A depth image (1, S, S) in metres as an RGB picture, near is bright."""
+def _depth_picture(depth: torch.Tensor, deepest: float) -> np.ndarray:
+    """A depth image (1, S, S) in metres up to ``deepest`` as an RGB picture, near is bright."""
     import matplotlib
 
-    near = 1 - depth[0].clamp(0, _DEPTH_MAX).numpy() / _DEPTH_MAX
+    near = 1 - depth[0].numpy() / deepest
     return _fit((matplotlib.colormaps["viridis"](near)[..., :3] * 255).astype(np.uint8))
 
 

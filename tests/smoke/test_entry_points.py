@@ -65,6 +65,23 @@ def test_evaluation_of_a_finished_run(finished, tmp_path):
     assert film.stat().st_size > 1000
 
 
+def test_a_killed_run_resumes_to_the_run_never_killed(tmp_path):
+    common = [*SMOKE, "steps=60", "evaluation.every=20", "evaluation.video_episodes=0"]
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    process = start("train.py", *common, f"output={killed}")
+    deadline = time.monotonic() + 120
+    while not (killed / "checkpoint.pt").exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.kill()
+    process.communicate()
+    assert not (killed / "report.md").exists()
+    for arguments in ([f"resume={killed}"], [*common, f"output={whole}"]):
+        code, _, err = call("train.py", *arguments)
+        assert code == 0, err
+    for table in ("metrics.csv", "validation.csv", "test.csv"):
+        assert (killed / table).read_bytes() == (whole / table).read_bytes(), table
+
+
 def test_interrupt_stops_with_a_checkpoint_and_resume_goes_on(tmp_path):
     folder = tmp_path / "run"
     process = start("train.py", *SMOKE, "steps=100000", f"output={folder}")
@@ -73,14 +90,16 @@ def test_interrupt_stops_with_a_checkpoint_and_resume_goes_on(tmp_path):
         time.sleep(0.2)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
-    assert process.returncode == 1 and f"resume={folder}" in err, err
-    config = (folder / "config.yaml").read_text()
+    assert process.returncode == 130 and str(folder) in err and "Traceback" not in err, err
     with open(folder / "metrics.csv") as file:
         step = int(list(csv.DictReader(file))[-1]["step"])
-    (folder / "config.yaml").write_text(config.replace("steps: 100000", f"steps: {step + 20}"))
-    code, out, err = call("train.py", f"resume={folder}")
+    code, _, err = call("train.py", f"resume={folder}", "seed=3")
+    assert code == 1 and "seed=3: a run is resumed with its own configuration" in err
+    shorter = [f"steps={step + 20}", "logging.progress=true"]
+    code, out, err = call("train.py", f"resume={folder}", *shorter)
     assert code == 0, err
     assert "episodes succeed" in out
+    assert "return=" in err and "greedy=" in err and "update=" in err  # the progress bar
     with open(folder / "metrics.csv") as file:
         steps = [int(row["step"]) for row in csv.DictReader(file)]
     assert steps == sorted(set(steps)) and steps[-1] <= step + 20
@@ -104,6 +123,8 @@ def test_multirun_over_groups_and_copies(tmp_path):
     assert len(reports) == 4
     configs = "".join((report.parent / "config.yaml").read_text() for report in reports)
     assert configs.count("group: D4") == 2 and configs.count("copies: 0") == 2
+    code, out, err = call("evaluate.py", f"run={reports[0].parent}", "episodes=1")
+    assert code == 0 and "of 1 episodes succeed" in out, err
 
 
 def test_cnn_baseline(tmp_path):
@@ -122,11 +143,15 @@ def test_cnn_baseline(tmp_path):
         (["env.image_size=100"], "env.image_size=100: expected one of 16, 32, 64, 128, 256"),
         (["colour=red"], "colour"),
         (["device=cuda:7"], "device=cuda:7"),
+        (["env.max_steps=3"], "failed 20 episodes in a row"),
+        (["--multirun", "output=x"], "a multirun makes a folder for each"),
+        (["resume=/nonexistent"], "/nonexistent"),
         (["output=/proc/none"], "/proc/none"),
     ],
 )
-def test_bad_input_ends_in_a_sentence_that_names_it(arguments, named):
-    code, _, err = call("train.py", *SMOKE, *arguments)
+def test_bad_input_ends_in_a_sentence_that_names_it(arguments, named, tmp_path):
+    resumes = arguments[0].startswith("resume=")
+    code, _, err = call("train.py", *([] if resumes else SMOKE), *arguments)
     assert code != 0
     assert named in err and "Traceback" not in err
 

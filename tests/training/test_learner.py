@@ -5,6 +5,7 @@ import torch
 from tensordict import TensorDict
 
 from equirl.training import TrainingRun, load_policy, train
+from equirl.training.folder import prepare_folder
 from equirl.training.learner import Learner
 
 
@@ -85,11 +86,9 @@ def test_without_averaging_the_actor_itself_is_kept(small_config):
 def test_a_loaded_policy_acts_as_the_trained_one(tmp_path, small_config, averaging):
     config = small_config(steps=6, algorithm={"averaging": averaging})
     tmp_path.joinpath("run").mkdir()
+    prepare_folder(tmp_path / "run", config)
     training = TrainingRun(config, tmp_path / "run")
     training.run()
-    from equirl.training.folder import prepare_folder
-
-    prepare_folder(tmp_path / "run", config)
     _, policy = load_policy(tmp_path / "run")
     data = batch()
     with torch.no_grad():

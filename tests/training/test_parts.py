@@ -1,15 +1,28 @@
 """Seeds, evaluation, metrics and folders of runs."""
 
 import itertools
+import threading
 
 import pytest
 import torch
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
-from equirl.collectors.online import OnlineCollector
+from equirl.collectors import DemonstrationError, OnlineCollector
 from equirl.envs import make_env, make_expert
-from equirl.training import FolderError, Purpose, evaluate, scene_seed
-from equirl.training.folder import claim_folder, prepare_folder
+from equirl.modules import make_actor, make_cnn_actor, shared_filters
+from equirl.modules.steerable import _Steerable
+from equirl.training import (
+    CheckpointError,
+    FolderError,
+    Purpose,
+    TrainingRun,
+    evaluate,
+    scene_seed,
+    train,
+)
+from equirl.training.evaluation import play
+from equirl.training.folder import claim_folder, stop_on_interrupt
 from equirl.training.metrics import MetricsLog
 
 
@@ -42,11 +55,34 @@ def test_evaluation_of_the_expert_and_of_idling(env):
     assert "0 of 2 episodes succeed" in str(outcome)
 
 
-def test_evaluation_draws_no_random_number(env):
-    torch.manual_seed(0)
+@pytest.mark.parametrize(
+    "policy",
+    [
+        lambda: make_actor("C4", hidden=8, image_size=16),
+        lambda: make_actor("C4", hidden=8, image_size=16, mode="paper"),
+        lambda: make_cnn_actor(hidden=8, image_size=16),
+    ],
+)
+def test_evaluation_is_deterministic_and_draws_no_random_number(env, policy):
+    actor = policy()
     before = torch.get_rng_state()
-    evaluate(env, make_expert(env), [1, 2])
+    outcomes = [evaluate(env, actor, [1, 2]) for _ in range(2)]
     assert torch.equal(before, torch.get_rng_state())
+    assert outcomes[0] == outcomes[1]
+
+
+def test_observations_go_to_the_policys_device_and_actions_come_back(env):
+    """Stands in for a GPU: the policy must see tensors of the device it is said to live on."""
+    seen = []
+
+    def policy(observation):
+        seen.append(observation["depth"].device.type)
+        return TensorDict({"action": torch.zeros(5)})
+
+    play(env, policy, 1, device="meta")
+    collector = OnlineCollector(env, policy, lambda i: i, device="meta")
+    collector.act()
+    assert set(seen) == {"meta"}
 
 
 def test_collector_rebuilds_its_open_episode(env):
@@ -88,8 +124,79 @@ def test_a_folder_serves_one_run_at_a_time(tmp_path):
         pass
 
 
-def test_an_unwritable_folder_is_named(tmp_path, small_config):
+def test_an_unwritable_folder_is_named(tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("")
-    with pytest.raises(FolderError, match=str(blocked)):
-        prepare_folder(blocked / "run", small_config())
+    with pytest.raises(FolderError, match=str(blocked)), claim_folder(blocked / "run"):
+        pass
+
+
+def test_a_full_disk_ends_in_a_sentence(tmp_path):
+    with pytest.raises(FolderError, match="No space left"), claim_folder(tmp_path):
+        raise OSError(28, "No space left on device")
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path, small_config):
+    (tmp_path / "metrics.csv").write_text("mine")
+    with pytest.raises(FolderError, match="not the folder of a run"):
+        train(small_config(), tmp_path)
+    assert (tmp_path / "metrics.csv").read_text() == "mine"
+
+
+def test_a_second_run_leaves_the_firsts_configuration_alone(tmp_path, small_config):
+    train(small_config(steps=2), tmp_path)
+    before = (tmp_path / "config.yaml").read_text()
+    with claim_folder(tmp_path), pytest.raises(FolderError, match="another run"):
+        train(small_config(steps=3), tmp_path)
+    assert (tmp_path / "config.yaml").read_text() == before
+
+
+def test_signals_are_asked_for_in_the_main_thread_only():
+    answers = []
+
+    def inside():
+        with stop_on_interrupt() as asked:
+            answers.append(asked())
+
+    thread = threading.Thread(target=inside)
+    thread.start()
+    thread.join()
+    assert answers == [False]
+
+
+def test_a_run_without_updates_says_so(tmp_path, small_config):
+    config = small_config(steps=10, demos={"episodes": 0}, replay={"start": 90})
+    train(config, tmp_path)
+    assert "No update was made" in (tmp_path / "report.md").read_text()
+
+
+def test_an_expert_that_cannot_succeed_is_named(tmp_path, small_config):
+    with pytest.raises(DemonstrationError, match="failed 20 episodes in a row"):
+        train(small_config(env={"max_steps": 3}), tmp_path)
+
+
+def test_results_of_an_earlier_end_go_when_the_run_is_prolonged(tmp_path, small_config):
+    train(small_config(steps=2), tmp_path)
+    assert (tmp_path / "report.md").exists()
+    run = TrainingRun(small_config(steps=1), tmp_path)
+    with pytest.raises(CheckpointError, match="at step 2, beyond steps=1"):
+        run.run()
+    train(small_config(steps=4), tmp_path)
+    assert "after 4 environment steps" in (tmp_path / "report.md").read_text()
+
+
+def test_filters_are_expanded_once_a_step(tmp_path, small_config, monkeypatch):
+    run = TrainingRun(small_config(replay={"start": 5}), tmp_path)
+    run._collect_demonstrations()
+    run.step = 1
+    expanded = []
+    expand = _Steerable._expand
+    monkeypatch.setattr(
+        _Steerable, "_expand", lambda self, w: expanded.append(w.data_ptr()) or expand(self, w)
+    )
+    with shared_filters():
+        run._step()
+    layers = sum(isinstance(m, _Steerable) for m in run.learner.loss.actor_network.modules())
+    heads = sum(isinstance(m, _Steerable) for m in run.learner.loss.qvalue_network.modules())
+    run.close()
+    assert len(expanded) == len(set(expanded)) == layers + 2 * heads  # actor, critic, target

@@ -45,10 +45,23 @@ def assert_same_run(first, second):
 
 
 @pytest.mark.parametrize(
-    ("stops", "options"), [((7,), {}), ((10, 17), {"averaging": 0.9, "decay": 0.5})]
+    ("stops", "changes"),
+    [
+        ((7,), {}),
+        ((10, 17), {"algorithm": {"averaging": 0.9, "decay": 0.5}}),
+        (
+            (13,),
+            {
+                "mode": "paper",
+                "env": {"robot": "panda"},
+                "replay": {"capacity": 75, "start": 40},  # 15 rows: the buffer wraps
+            },
+        ),
+        ((5,), {"method": {"name": "cnn"}, "augmentation": {"name": "none"}}),
+    ],
 )
-def test_interrupted_run_equals_uninterrupted(tmp_path, small_config, stops, options):
-    config = small_config(algorithm=options)
+def test_interrupted_run_equals_uninterrupted(tmp_path, small_config, stops, changes):
+    config = small_config(**changes)
     run(config, tmp_path / "whole")
     for stop in stops:
         stopped = run(config, tmp_path / "parts", stop_after=stop)
