@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import os
 import platform
+import resource
 import statistics
 import time
 from collections.abc import Callable
@@ -32,6 +33,7 @@ def main() -> None:
         "build": build,
         "update": update,
         "acting": acting,
+        "memory": memory,
     }
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", choices=tables, help="one table")
@@ -59,13 +61,13 @@ def environment(arguments: argparse.Namespace) -> None:
             current = env.reset()
             while len(stepping) < arguments.steps:
                 acted = expert(current)
-                start = time.process_time()
+                start = time.perf_counter()
                 current = env.step(acted)["next"]
-                stepping.append(time.process_time() - start)
+                stepping.append(time.perf_counter() - start)
                 if current["done"].item():
-                    start = time.process_time()
+                    start = time.perf_counter()
                     current = env.reset()
-                    resetting.append(time.process_time() - start)
+                    resetting.append(time.perf_counter() - start)
             env.close()
             alone = len(stepping) / sum(stepping)
             whole = len(stepping) / (sum(stepping) + sum(resetting))
@@ -86,7 +88,7 @@ def build(arguments: argparse.Namespace) -> None:
 
 
 def update(arguments: argparse.Namespace) -> None:
-    """Milliseconds of one SAC update and its parts, medians."""
+    """Milliseconds of one SAC update and its parts, medians; critic heads of 64 fields."""
     print(
         "| group | hidden | image | batch | sample | losses | backward | Adam | target | update |"
     )
@@ -132,6 +134,18 @@ def acting(arguments: argparse.Namespace) -> None:
         print(f"| {group} | {hidden} | {size} | {1e3 * statistics.median(times[2:]):.1f} |")
 
 
+def memory(arguments: argparse.Namespace) -> None:
+    """What the replay buffer of the paper's setting takes, and the peak of this process."""
+    config = _config("D4", 8, 128)
+    buffer = _filled_buffer(config)
+    rows = buffer.storage[: len(buffer)]
+    row = sum(leaf.nbytes for leaf in rows.values(True, True)) / len(buffer)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    print("| replay, 100,000 transitions of 128 x 128, 4 copies | peak of this process |")
+    print("| --- | --- |")
+    print(f"| {row * 100_000 / 5 / 1e9:.2f} GB | {peak:.2f} GiB |")
+
+
 class _Clock:
     def __init__(self, parts: dict[str, list[float]]):
         self.parts, self.last = parts, time.perf_counter()
@@ -146,7 +160,7 @@ def _config(group: str, hidden: int, size: int) -> Config:
     return to_config(
         {
             "env": {"task": "block_picking", "image_size": size},
-            "method": {"name": "equivariant", "hidden": hidden},
+            "method": {"name": "equivariant", "hidden": hidden, "head_width": 64},
             "algorithm": {"name": "sac"},
             "augmentation": {"name": "buffer"},
             "group": group,
