@@ -21,6 +21,7 @@ from equirl.config import Config, ConfigError, TrainJob, load_config, register, 
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL logs to the standard output
 register()
+_failed: list[str] = []  # jobs of a multirun, each with its reason
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="config")
@@ -37,9 +38,10 @@ def main(values: DictConfig) -> None:
         outcome = train(config, folder)
     except (ConfigError, FolderError, CheckpointError, DemonstrationError) as error:
         print(f"error: {error}", file=sys.stderr, flush=True)
-        if multirun:  # Hydra goes on with the other jobs and fails at the end
-            raise
-        sys.exit(1)
+        if not multirun:
+            sys.exit(1)
+        _failed.append(f"{' '.join(HydraConfig.get().overrides.task)}: {error}")
+        return  # the other jobs of the sweep go on
     except KeyboardInterrupt:
         outcome = None
     if outcome is None:
@@ -84,3 +86,5 @@ def _resumed(folder: Path) -> Config:
 
 if __name__ == "__main__":
     main()
+    if _failed:
+        sys.exit("\n".join([f"{len(_failed)} jobs failed:", *_failed]))

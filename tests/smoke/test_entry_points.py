@@ -164,3 +164,19 @@ def test_benchmark_prints_its_tables():
     assert code == 0, err
     for row in ("| panda | 64 |", "| 1,113,118 | 1,178,970 |", "| D4 | 16 | 64 | 64 |"):
         assert row in out
+
+
+def test_a_failing_job_does_not_stop_a_multirun(tmp_path):
+    code, out, err = call(
+        "train.py",
+        "--multirun",
+        *(key for key in SMOKE if not key.startswith("group")),
+        "group=so2,c4",
+        "steps=4",
+        "demos.episodes=1",
+        "evaluation.final_episodes=1",
+        "evaluation.video_episodes=0",
+        f"hydra.sweep.dir={tmp_path}",
+    )
+    assert code == 1 and "1 jobs failed" in err and "group=so2" in err and "Traceback" not in err
+    assert "of 1 episodes succeed" in out
