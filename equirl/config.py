@@ -49,7 +49,6 @@ class AlgorithmConfig:
     tau: float = 1e-2  # share of the critic that moves into its target each update
     alpha: float = 1e-2  # initial temperature
     target_entropy: float = -5.0
-    decay: float = 0.0  # share of the run, its end, in which the learning rate falls to 0
     averaging: float = 0.0  # decay of the average of the actor that is evaluated; 0: none
 
 
@@ -171,10 +170,6 @@ def validate(config: Config) -> Config:
         if not low < value <= high:
             raise ConfigError(f"{key}={value}: expected a number above {low}, at most {high}")
 
-    def share(key: str, value: float) -> None:
-        if not 0 <= value < 1:
-            raise ConfigError(f"{key}={value}: expected 0 or more, below 1")
-
     try:
         config.group = SymmetryGroup(config.group).name
     except ValueError as error:
@@ -218,8 +213,10 @@ def validate(config: Config) -> Config:
     within("algorithm.discount", config.algorithm.discount, 0, 1)
     within("evaluation.discount", config.evaluation.discount, 0, 1)
     within("algorithm.tau", config.algorithm.tau, 0, 1)
-    share("algorithm.decay", config.algorithm.decay)
-    share("algorithm.averaging", config.algorithm.averaging)
+    if not 0 <= config.algorithm.averaging < 1:
+        raise ConfigError(
+            f"algorithm.averaging={config.algorithm.averaging}: expected 0 or more, below 1"
+        )
     within("algorithm.alpha", config.algorithm.alpha, 0, 1e6)
     return config
 

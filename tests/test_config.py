@@ -92,7 +92,7 @@ def test_presets_compose_into_valid_configurations(preset):
         learner = config.algorithm
         assert (learner.learning_rate, learner.batch_size, learner.discount) == (1e-3, 64, 0.99)
         assert (learner.tau, learner.alpha, learner.target_entropy) == (1e-2, 1e-2, -5)
-        assert (learner.decay, learner.averaging, config.method.head_width) == (0, 0, 0)
+        assert (learner.averaging, config.method.head_width) == (0, 0)
         assert (config.steps, config.copies, config.demos.episodes) == (10_000, 4, 20)
     else:
         assert config.mode == "strict"

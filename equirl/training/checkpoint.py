@@ -74,13 +74,10 @@ def check_same_config(config: dict[str, Any], stored: dict[str, Any], where: Pat
     Raises:
         CheckpointError: They differ; the message names each key and both values.
     """
-    free = set(_FREE_KEYS)
-    if config.get("algorithm.decay"):
-        free.discard("steps")  # the learning rate's schedule depends on it
     different = [
         f"{key} is {stored.get(key)} there and {value} here"
         for key, value in config.items()
-        if stored.get(key) != value and key not in free and not key.startswith(_FREE_GROUPS)
+        if stored.get(key) != value and key not in _FREE_KEYS and not key.startswith(_FREE_GROUPS)
     ]
     if different:
         raise CheckpointError(

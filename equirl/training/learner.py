@@ -7,7 +7,6 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torch.optim.lr_scheduler import LambdaLR
 from torch.optim.swa_utils import AveragedModel
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import SoftUpdate
@@ -66,11 +65,6 @@ class Learner:
         self.optimizer = torch.optim.Adam(
             self.loss.parameters(), lr=algorithm.learning_rate, fused=True
         )
-        falling = algorithm.decay * config.steps  # updates of the falling learning rate
-        self.schedule = LambdaLR(
-            self.optimizer,
-            lambda update: min(1.0, (config.steps - update) / falling) if falling else 1.0,
-        )
 
     @property
     def policy(self) -> ProbabilisticActor:
@@ -90,7 +84,6 @@ class Learner:
         self.optimizer.zero_grad(set_to_none=True)
         (losses["loss_actor"] + losses["loss_qvalue"] + losses["loss_alpha"]).backward()
         self.optimizer.step()
-        self.schedule.step()
         self.target_update.step()
         if self.average is not None:
             self.average.update_parameters(self.actor)
@@ -98,11 +91,10 @@ class Learner:
         return metrics | {"td_error": batch["td_error"].mean().item()}
 
     def state_dict(self) -> dict[str, Any]:
-        """Networks, targets, temperature, optimiser and its schedule, average."""
+        """Networks, targets, temperature, optimiser and average."""
         state = {
             "loss": self.loss.state_dict(),
             "optimizer": self.optimizer.state_dict(),
-            "updates": self.schedule.last_epoch,
         }
         if self.average is not None:
             state["average"] = self.average.state_dict()
@@ -112,7 +104,6 @@ class Learner:
         """Restores what :meth:`state_dict` returned."""
         self.loss.load_state_dict(state["loss"])
         self.optimizer.load_state_dict(state["optimizer"])
-        self.schedule.last_epoch = state["updates"]
         if self.average is not None:
             self.average.load_state_dict(state["average"])
 

@@ -68,15 +68,6 @@ def test_average_is_a_plain_mean_at_first_and_exponential_later(small_config):
     assert any((a != b).any() for a, b in zip(values(learner.policy), history[-1], strict=True))
 
 
-def test_learning_rate_falls_to_zero_over_the_end_of_the_run(small_config):
-    learner = Learner(small_config(steps=8, algorithm={"decay": 0.5, "learning_rate": 0.01}))
-    rates = []
-    for _ in range(8):
-        rates.append(learner.optimizer.param_groups[0]["lr"])
-        learner.update(batch())
-    assert rates == pytest.approx([0.01] * 5 + [0.0075, 0.005, 0.0025])
-
-
 def test_without_averaging_the_actor_itself_is_kept(small_config):
     learner = Learner(small_config())
     assert learner.policy is learner.actor

@@ -48,7 +48,7 @@ def assert_same_run(first, second):
     ("stops", "changes"),
     [
         ((7,), {}),
-        ((10, 17), {"algorithm": {"averaging": 0.9, "decay": 0.5}}),
+        ((10, 17), {"algorithm": {"averaging": 0.9}}),
         (
             (13,),
             {
@@ -103,12 +103,6 @@ def test_checkpoint_of_another_configuration_is_refused(tmp_path, small_config):
     run(small_config(), tmp_path / "a", stop_after=3)
     with pytest.raises(CheckpointError, match=r"group is C4 there and D4 here"):
         run(small_config(group="D4"), tmp_path / "a")
-
-
-def test_a_run_whose_schedule_ends_at_its_last_step_is_not_prolonged(tmp_path, small_config):
-    run(small_config(steps=6, algorithm={"decay": 0.5}), tmp_path / "a")
-    with pytest.raises(CheckpointError, match="steps is 6 there and 12 here"):
-        run(small_config(steps=12, algorithm={"decay": 0.5}), tmp_path / "a")
 
 
 def test_damaged_checkpoint_is_named(tmp_path, small_config):
