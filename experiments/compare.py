@@ -48,7 +48,7 @@ def summary(label: str, folder: Path) -> dict[str, str | int]:
     """One line of the table."""
     test = read_table(folder / "test.csv")
     timing = read_table(folder / "timing.csv")
-    validation = read_table(folder / "validation.csv")
+    validation = read_table(folder / "validation.csv") or {"step": [], "success_rate": []}
     successes, episodes = int(sum(test["success"])), len(test["success"])
     low, high = wilson_interval(successes, episodes)
     pairs = zip(validation["step"], validation["success_rate"], strict=True)
@@ -61,8 +61,8 @@ def summary(label: str, folder: Path) -> dict[str, str | int]:
         "95 % interval": f"{low:.0%} to {high:.0%}",
         "mean length of a success": f"{sum(solved) / len(solved):.1f}" if solved else "-",
         "first validation of 90 %": first,
-        "minutes": f"{timing['minutes'][-1]:.1f}",
-        "update ms": f"{timing['update_ms'][-1]:.0f}",
+        "minutes": f"{timing['minutes'][-1]:.1f}" if timing else "-",
+        "update ms": f"{timing['update_ms'][-1]:.0f}" if timing else "-",
     }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -52,7 +53,7 @@ def plot_runs(groups: dict[str, Sequence[Path]], path: Path, *, title: str = "")
     """
     plt = _pyplot()
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
-    for colour, (label, folders) in zip(_COLOURS, groups.items(), strict=False):
+    for colour, (label, folders) in zip(cycle(_COLOURS), groups.items(), strict=False):
         _draw_success(left, folders, label, colour)
         _draw_return(right, folders, label, colour)
     left.legend(frameon=False)
@@ -67,9 +68,9 @@ def _draw_success(axes: Axes, folders: Sequence[Path], label: str, colour: str) 
         if len(tables) == 1:
             axes.fill_between(table["step"], table["low"], table["high"], color=colour, alpha=0.15)
     if tables:
-        length = min(len(table["step"]) for table in tables)
-        mean = np.mean([table["success_rate"][:length] for table in tables], axis=0)
-        axes.plot(tables[0]["step"][:length], mean, color=colour, lw=2, label=label)
+        steps = sorted(set.intersection(*(set(table["step"]) for table in tables)))
+        rates = [np.interp(steps, table["step"], table["success_rate"]) for table in tables]
+        axes.plot(steps, np.mean(rates, axis=0), color=colour, lw=2, label=label)
     axes.set(title="greedy success, held-out scenes", ylim=(-0.03, 1.03))
     axes.set_xlabel("environment steps")
 

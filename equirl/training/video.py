@@ -49,7 +49,9 @@ def film_policy(
     with writer:
 
         def film(depth: torch.Tensor) -> None:
-            writer.append_data(np.hstack([_fit(env.render()), _depth_picture(depth, deepest)]))
+            writer.append_data(
+                np.hstack([env.render(_SIDE, _SIDE), _depth_picture(depth, deepest)])
+            )
 
         for seed in seeds:
             play(env, policy, seed, device=device, on_step=film)
@@ -61,14 +63,10 @@ def _depth_picture(depth: torch.Tensor, deepest: float) -> np.ndarray:
     import matplotlib
 
     near = 1 - depth[0].numpy() / deepest
-    return _fit((matplotlib.colormaps["viridis"](near)[..., :3] * 255).astype(np.uint8))
+    return _enlarged((matplotlib.colormaps["viridis"](near)[..., :3] * 255).astype(np.uint8))
 
 
-def _fit(picture: np.ndarray) -> np.ndarray:
-    """Crops a picture (H, W, 3) to a square and resizes it to the film's size."""
-    height, width = picture.shape[:2]
-    side = min(height, width)
-    top, left = (height - side) // 2, (width - side) // 2
-    picture = picture[top : top + side, left : left + side]
-    index = np.arange(_SIDE) * side // _SIDE
+def _enlarged(picture: np.ndarray) -> np.ndarray:
+    """Resizes a square picture (S, S, 3) to the film's size, pixels kept sharp."""
+    index = np.arange(_SIDE) * len(picture) // _SIDE
     return picture[index][:, index]

@@ -180,3 +180,13 @@ def test_a_failing_job_does_not_stop_a_multirun(tmp_path):
     )
     assert code == 1 and "1 jobs failed" in err and "group=so2" in err and "Traceback" not in err
     assert "of 1 episodes succeed" in out
+
+
+def test_comparison_of_runs(finished, tmp_path):
+    groups = [f"D4={finished},{finished}", f"CNN={finished}"]
+    code, out, err = call("compare.py", str(tmp_path / "out"), *groups)
+    assert code == 0, err
+    assert out.count("/3 |") == 3 and "| CNN | finished |" in out
+    assert (tmp_path / "out" / "curves.png").read_bytes()[:4] == b"\x89PNG"
+    code, _, err = call("compare.py", str(tmp_path / "out"), "D4=/nonexistent")
+    assert code != 0 and "/nonexistent is not the folder of a finished run" in err
