@@ -12,8 +12,7 @@ from torchrl.collectors import BaseCollector
 from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
 
-_OBSERVED = ("depth", "holding")
-_NEXT = (*_OBSERVED, "reward", "done", "terminated", "truncated")
+from equirl.data import TRANSITION_KEYS
 
 
 class DemonstrationError(RuntimeError):
@@ -23,9 +22,8 @@ class DemonstrationError(RuntimeError):
 class DemonstrationCollector(BaseCollector):
     """Yields successful episodes of an expert, one TensorDict each; failed ones are discarded.
 
-    An episode has shape [T] and exactly the keys ``depth``, ``holding``, ``action``, ``expert``
-    (T, 1) bool and True, and ``next``: ``depth``, ``holding``, ``reward``, ``done``,
-    ``terminated``, ``truncated``. An episode is successful when its last reward is positive.
+    An episode has shape [T] and the keys of `equirl.data.TRANSITION_KEYS`, ``expert`` True. It
+    is successful when its last reward is positive.
 
     Attempt k is a function of ``seed`` and k alone (given a deterministic policy): the collector
     derives the environment's seed for it and leaves the environment in the attempt's final state.
@@ -135,8 +133,8 @@ class DemonstrationCollector(BaseCollector):
 
     @staticmethod
     def _transition(step: TensorDictBase) -> TensorDict:
-        transition = step.select(*_OBSERVED, "action", *(("next", key) for key in _NEXT))
-        return transition.set("expert", torch.ones(1, dtype=torch.bool))
+        labelled = step.copy().set("expert", torch.ones(1, dtype=torch.bool))
+        return labelled.select(*TRANSITION_KEYS)
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         """Starts over from ``seed``: the next iteration yields ``episodes`` episodes again.

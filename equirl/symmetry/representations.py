@@ -102,8 +102,8 @@ class ScalarField:
 
     The centre of rotation is the image's centre, a corner of four pixels when S is
     even. Elements that preserve the grid permute pixels exactly; other angles are
-    interpolated bilinearly and the border is replicated (SPEC of the paper's buffer
-    augmentation, appendix F).
+    interpolated bilinearly and the border is replicated, as in the paper's buffer
+    augmentation (appendix F).
     """
 
     def transform(self, image: Tensor, element: Element) -> Tensor:
