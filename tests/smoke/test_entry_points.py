@@ -66,7 +66,7 @@ def test_evaluation_of_a_finished_run(finished, tmp_path):
 
 
 def test_a_killed_run_resumes_to_the_run_never_killed(tmp_path):
-    common = [*SMOKE, "steps=60", "evaluation.every=20", "evaluation.video_episodes=0"]
+    common = [*SMOKE, "steps=200", "evaluation.every=100", "evaluation.video_episodes=0"]
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     process = start("train.py", *common, f"output={killed}")
     deadline = time.monotonic() + 120
