@@ -3,13 +3,14 @@ PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+KERNELS := $(wildcard equirl/modules/native/*.[ch]pp)
 
 .PHONY: setup demo test test-all lint format benchmark clean
 
 setup: $(READY)
 
 # uv honours the dependency override in pyproject.toml that spares a Fortran compiler.
-$(READY): setup.cfg pyproject.toml constraints.txt
+$(READY): setup.py setup.cfg pyproject.toml constraints.txt $(KERNELS)
 	@command -v $(PYTHON) >/dev/null || { echo "error: $(PYTHON) not found; equirl needs Python 3.11 (PyBullet has no newer wheels)"; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
@@ -40,4 +41,5 @@ benchmark: setup
 
 clean:
 	rm -rf $(VENV) build *.egg-info .pytest_cache .hypothesis .mypy_cache .ruff_cache
+	rm -f equirl/modules/native/*.so
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -56,13 +56,16 @@ def shared_filters() -> Iterator[None]:
         _active.reset(token)
 
 
-def expanded_filter(owner: object, weights: Tensor, expand: Callable[[Tensor], Tensor]) -> Tensor:
+def expanded_filter(
+    owner: object, weights: Tensor, expand: Callable[[Tensor], Tensor], form: str = "dense"
+) -> Tensor:
     """The filter of a module, from the active cache where there is one.
 
     Args:
         owner: The module; it stands for the meaning of the weights.
         weights: Its weights, possibly swapped in or detached.
         expand: Computes the filter of the weights.
+        form: What ``expand`` makes of them; forms are kept apart.
 
     Returns:
         The filter; part of the autograd graph if the weights require a gradient and
@@ -75,14 +78,13 @@ def expanded_filter(owner: object, weights: Tensor, expand: Callable[[Tensor], T
         address = weights.data_ptr()
     except RuntimeError:  # a tensor without storage: inside vmap or another transform
         return expand(weights)
-    key = (id(owner), address, weights.dtype, weights.device, torch.is_inference_mode_enabled())
+    inference = torch.is_inference_mode_enabled()
+    key = (id(owner), form, address, weights.dtype, weights.device, inference)
     needs_grad = weights.requires_grad and torch.is_grad_enabled()
     entry = cache.get(key)
     if entry is None or not _serves(entry, weights, needs_grad):
         # With its graph even where this pass needs none, so that a later one can use it.
-        with torch.set_grad_enabled(
-            weights.requires_grad and not torch.is_inference_mode_enabled()
-        ):
+        with torch.set_grad_enabled(weights.requires_grad and not inference):
             entry = _Entry(weights, weights.detach().clone(), expand(weights))
         cache[key] = entry
     return entry.filter if needs_grad else entry.filter.detach()

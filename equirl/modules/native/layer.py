@@ -1,0 +1,246 @@
+"""Convolution, maximum and ReLU of steerable layers in one native call."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from ..fields import FieldType
+from ..filters import expanded_filter
+from ..steerable import SteerableConv
+from .library import load
+from .spectral import SpectralBasis, spectral_basis
+
+__all__ = [
+    "BLOCK",
+    "channel_order",
+    "conv_block",
+    "encode",
+    "from_blocks",
+    "runs",
+    "to_blocks",
+]
+
+#: Images side by side in memory; a batch is padded to a multiple.
+BLOCK = 16
+
+#: Fewer images than this are faster on the dense backend, whose work shrinks with them.
+SMALLEST_BATCH = 4
+
+
+class _Layer(ctypes.Structure):
+    """What the kernels need to know of a layer; mirrors the struct of kernels.hpp."""
+
+    _fields_ = (
+        ("order", ctypes.c_int32),
+        ("regular", ctypes.c_int32),
+        ("fields_in", ctypes.c_int32),
+        ("fields_out", ctypes.c_int32),
+        ("height", ctypes.c_int32),
+        ("width", ctypes.c_int32),
+        ("padding", ctypes.c_int32),
+        ("pool", ctypes.c_int32),
+        ("relu", ctypes.c_int32),
+        ("edge", ctypes.c_float),
+        ("axis", ctypes.c_float),
+    )
+
+
+def _basis_of(conv: SteerableConv) -> SpectralBasis:
+    basis = None
+    if conv.kernel_size == 3 and conv.padding <= 2 and conv.out_type.is_regular:
+        kinds = conv.in_type.kinds
+        basis = spectral_basis(conv.in_type.group, kinds[0]) if len(kinds) == 1 else None
+    if basis is None:
+        raise ValueError(
+            "the native kernels serve 3 x 3 convolutions from regular or trivial to regular "
+            f"fields of groups with quarter turns, padding at most 2; got {conv}, "
+            f"padding={conv.padding}"
+        )
+    return basis
+
+
+def runs(layers: Iterable[SteerableConv], x: Tensor) -> bool:
+    """Whether the kernels can take a batch of images (B, C, H, W) through supported layers.
+
+    They compute in float32 on the CPU, without a gradient for the images, outside of
+    ``vmap``, ``torch.func`` and compilation. A few images are faster without them.
+    """
+    tensors = [x, *(layer.weights for layer in layers)]
+    return (
+        len(x) >= SMALLEST_BATCH
+        and not x.requires_grad
+        and all(t.dtype is torch.float32 and t.device.type == "cpu" for t in tensors)
+        and not torch.compiler.is_compiling()
+        and not torch.is_autocast_enabled("cpu")
+        and all(_has_memory(t) for t in tensors)
+    )
+
+
+def _has_memory(tensor: Tensor) -> bool:
+    try:
+        return tensor.data_ptr() != 0
+    except RuntimeError:  # inside vmap or another transform
+        return False
+
+
+def encode(layers: Sequence[SteerableConv], pools: Sequence[bool], x: Tensor) -> Tensor:
+    """Takes images through convolutions, each followed by a maximum or not, and a ReLU.
+
+    Args:
+        layers: Supported layers in sequence, the first of trivial fields.
+        pools: For each layer whether a 2 x 2 maximum follows.
+        x: Images (B, C, H, W) that :func:`runs` accepts.
+
+    Returns:
+        Shape (B, out channels, H', W'), channels in the order of the last layer's fields.
+    """
+    batch, x = len(x), to_blocks(x)
+    for layer, pool in zip(layers, pools, strict=True):
+        x = conv_block(layer, x, pool=pool, relu=True)
+    order = channel_order(layers[-1].out_type)
+    x = from_blocks(x, batch)
+    return x if order is None else x.index_select(1, order)
+
+
+@functools.cache
+def channel_order(fields: FieldType) -> Tensor | None:
+    """Takes regular channels from the kernels' order to their own; None if they agree.
+
+    The kernels keep the channels of a field coset by coset of C4 or D4.
+    """
+    basis = spectral_basis(fields.group, "regular")
+    assert basis is not None
+    if basis.cosets == 1:
+        return None
+    inverse = torch.tensor(basis.channels).argsort()
+    starts = torch.arange(0, fields.size, fields.group.order)
+    return (starts[:, None] + inverse).flatten()
+
+
+def to_blocks(x: Tensor, channels: int = 1) -> Tensor:
+    """Arranges feature maps as the kernels want them.
+
+    Args:
+        x: Shape (B, fields * channels, H, W).
+        channels: Channels of a field.
+
+    Returns:
+        Shape (ceil(B / 16), fields, H, W, channels, 16), filled up with zeros.
+    """
+    missing = -len(x) % BLOCK
+    if missing:
+        x = F.pad(x, (0, 0, 0, 0, 0, 0, 0, missing))
+    x = x.unflatten(1, (-1, channels)).unflatten(0, (-1, BLOCK))
+    return x.permute(0, 2, 4, 5, 3, 1).contiguous()
+
+
+def from_blocks(x: Tensor, batch: int) -> Tensor:
+    """The inverse of :func:`to_blocks` for a batch of that many maps."""
+    return x.permute(0, 5, 1, 4, 2, 3).flatten(2, 3).flatten(0, 1)[:batch]
+
+
+def conv_block(conv: SteerableConv, x: Tensor, pool: bool = False, relu: bool = False) -> Tensor:
+    """A steerable convolution, then optionally a 2 x 2 maximum, then optionally a ReLU.
+
+    Differentiable once, with respect to the input if its fields are regular, the weights
+    and the bias. The result does not depend on the number of threads.
+
+    Args:
+        conv: The layer; its parameters are read, possibly swapped in functionally.
+        x: Blocks of maps, float32, see :func:`to_blocks`: trivial fields of one channel, or
+            regular fields of the subgroup in the kernels' order, see :func:`channel_order`.
+        pool: Whether to take the maximum; the convolution's height and width must be even.
+        relu: Whether to apply the ReLU.
+
+    Returns:
+        Blocks of maps, regular fields of the subgroup in the kernels' order.
+    """
+    basis = _basis_of(conv)
+    fields_out, fields_in = len(conv.out_type.fields), len(conv.in_type.fields)
+    weights = expanded_filter(
+        conv, conv.weights, lambda w: basis.expand(w, fields_out, fields_in), form="spectral"
+    )
+    shifts = x.new_zeros(fields_out) if conv.bias is None else conv.bias
+    bias = (shifts * conv.in_type.group.order**-0.5).repeat_interleave(basis.cosets)
+    return _ConvBlock.apply(x, weights, bias, basis, conv.padding, pool, relu)
+
+
+class _ConvBlock(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        x: Tensor,
+        weights: Tensor,
+        bias: Tensor,
+        basis: SpectralBasis,
+        padding: int,
+        pool: bool,
+        relu: bool,
+    ) -> Tensor:
+        blocks, _, height, width, _, _ = x.shape
+        fields_out, fields_in, _ = weights.shape
+        layer = _Layer(
+            basis.order, basis.regular, fields_in, fields_out, height, width,
+            padding, pool, relu, basis.edge, basis.axis,
+        )  # fmt: skip
+        high, wide = (size - 2 + 2 * padding for size in (height, width))
+        if pool:
+            high, wide = high // 2, wide // 2
+        shape = (blocks, fields_out, high, wide, basis.order, BLOCK)
+        y = x.new_empty(shape)
+        choice = torch.empty(shape if pool else 0, dtype=torch.uint8)
+        x, weights, bias = x.contiguous(), weights.contiguous(), bias.contiguous()
+        _functions().equirl_forward(
+            ctypes.byref(layer), blocks, x.data_ptr(), weights.data_ptr(), bias.data_ptr(),
+            y.data_ptr(), choice.data_ptr(), torch.get_num_threads(),
+        )  # fmt: skip
+        ctx.layer, ctx.basis = layer, basis
+        ctx.save_for_backward(x, weights, y if relu and not pool else None, choice)
+        return y
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        x, weights, y, choice = ctx.saved_tensors
+        gradient = gradient.contiguous()
+        common = (gradient.data_ptr(), y.data_ptr() if y is not None else None, choice.data_ptr())
+        layer, blocks, threads = ctypes.byref(ctx.layer), len(x), torch.get_num_threads()
+        dx = dw = db = None
+        if ctx.needs_input_grad[0]:
+            dx, transposed = torch.empty_like(x), ctx.basis.transpose(weights)
+            _functions().equirl_input_gradient(
+                layer, blocks, *common, transposed.data_ptr(), dx.data_ptr(), threads
+            )
+        if ctx.needs_input_grad[1] or ctx.needs_input_grad[2]:
+            dw, db = torch.empty_like(weights), weights.new_empty(len(weights))
+            _functions().equirl_weight_gradient(
+                layer, blocks, x.data_ptr(), *common, dw.data_ptr(), db.data_ptr(), threads
+            )
+        return dx, dw, db, None, None, None, None
+
+
+@functools.cache
+def _functions() -> ctypes.CDLL:
+    handle = load().handle
+    for name, pointers in (
+        ("equirl_forward", 5),
+        ("equirl_input_gradient", 5),
+        ("equirl_weight_gradient", 6),
+    ):
+        function = getattr(handle, name)
+        function.restype = None
+        function.argtypes = [
+            ctypes.POINTER(_Layer),
+            ctypes.c_int32,
+            *[ctypes.c_void_p] * pointers,
+            ctypes.c_int32,
+        ]
+    return handle
