@@ -116,6 +116,7 @@ class Config:
     seed: int = 0
     device: str = "auto"  # "auto", "cpu" or "cuda:<i>"
     threads: int = 0  # CPU threads of torch; 0: all cores
+    backend: str = "auto"  # of equivariant encoders: "native", "dense" or "auto", the faster one
 
     @property
     def torch_device(self) -> str:
@@ -144,6 +145,7 @@ class EvaluateJob:
     episodes: int = 100
     first: int = 0  # number of the first test scene
     device: str = "auto"
+    backend: str = "auto"
     video: str = ""  # MP4 file to film the first episodes into
     video_episodes: int = 3
 
@@ -155,12 +157,9 @@ def validate(config: Config) -> Config:
         ConfigError: Names the first key whose value no run can have, and what it takes.
     """
     from equirl.envs.tasks import TASKS
+    from equirl.modules.backend import BACKENDS
     from equirl.modules.layout import check_sizes
     from equirl.symmetry import SymmetryGroup
-
-    def choice(key: str, value: object, *allowed: object) -> None:
-        if value not in allowed:
-            raise ConfigError(f"{key}={value}: expected one of {', '.join(map(str, allowed))}")
 
     def at_least(key: str, value: float, lowest: float) -> None:
         if not value >= lowest:
@@ -174,13 +173,14 @@ def validate(config: Config) -> Config:
         config.group = SymmetryGroup(config.group).name
     except ValueError as error:
         raise ConfigError(f"group={config.group}: {error}") from None
-    choice("mode", config.mode, "strict", "paper")
-    choice("env.task", config.env.task, *TASKS)
-    choice("env.robot", config.env.robot, "panda", "hand")
-    choice("method", config.method.name, "equivariant", "cnn")
-    choice("algorithm", config.algorithm.name, "sac")
-    choice("augmentation", config.augmentation.name, "buffer", "none")
-    choice("logging.wandb_mode", config.logging.wandb_mode, "offline", "online")
+    _choice("mode", config.mode, "strict", "paper")
+    _choice("env.task", config.env.task, *TASKS)
+    _choice("env.robot", config.env.robot, "panda", "hand")
+    _choice("method", config.method.name, "equivariant", "cnn")
+    _choice("algorithm", config.algorithm.name, "sac")
+    _choice("augmentation", config.augmentation.name, "buffer", "none")
+    _choice("logging.wandb_mode", config.logging.wandb_mode, "offline", "online")
+    _choice("backend", config.backend, *BACKENDS)
     try:
         check_sizes(config.method.hidden, config.env.image_size)
     except ValueError as error:
@@ -221,10 +221,18 @@ def validate(config: Config) -> Config:
     return config
 
 
+def _choice(key: str, value: object, *allowed: object) -> None:
+    if value not in allowed:
+        raise ConfigError(f"{key}={value}: expected one of {', '.join(map(str, allowed))}")
+
+
 def _validate_evaluation(job: EvaluateJob) -> EvaluateJob:
+    from equirl.modules.backend import BACKENDS
+
     for key, lowest in (("episodes", 1), ("first", 0), ("video_episodes", 1)):
         if getattr(job, key) < lowest:
             raise ConfigError(f"{key}={getattr(job, key)}: expected {lowest} or more")
+    _choice("backend", job.backend, *BACKENDS)
     return job
 
 

@@ -6,6 +6,7 @@ python experiments/evaluate.py run=outputs/demo video=policy.mp4 first=100
 
 from __future__ import annotations
 
+import logging
 import sys
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from omegaconf import DictConfig
 from equirl.config import ConfigError, EvaluateJob, register, to_config
 
 register()
+_log = logging.StreamHandler()  # for the package's own messages, to the standard error
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="evaluate")
@@ -32,9 +34,11 @@ def main(values: DictConfig) -> None:
         scene_seed,
     )
 
+    logging.getLogger("equirl").addHandler(_log)
+    logging.getLogger("equirl").setLevel(logging.INFO)
     try:
         job = to_config(values, EvaluateJob)
-        config, policy = load_policy(Path(job.run), job.device)
+        config, policy = load_policy(Path(job.run), job.device, job.backend)
     except (ConfigError, CheckpointError) as error:
         sys.exit(f"error: {error}")
     device = config.torch_device

@@ -7,6 +7,7 @@ python experiments/train.py resume=outputs/my_run
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from datetime import datetime
@@ -21,6 +22,7 @@ from equirl.config import Config, ConfigError, TrainJob, load_config, register, 
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL logs to the standard output
 register()
+_log = logging.StreamHandler()  # for the package's own messages, to the standard error
 _failed: list[str] = []  # jobs of a multirun, each with its reason
 
 
@@ -30,6 +32,8 @@ def main(values: DictConfig) -> None:
     from equirl.collectors import DemonstrationError
     from equirl.training import CheckpointError, FolderError, train
 
+    logging.getLogger("equirl").addHandler(_log)
+    logging.getLogger("equirl").setLevel(logging.INFO)
     multirun = HydraConfig.get().mode == RunMode.MULTIRUN
     folder = None
     try:
@@ -73,7 +77,10 @@ def _job(values: DictConfig, multirun: bool) -> tuple[Config, Path]:
 def _resumed(folder: Path) -> Config:
     """The configuration of an interrupted run, with what may be changed on the way."""
     changes = [text for text in HydraConfig.get().overrides.task if not text.startswith("resume=")]
-    free = ("steps=", "device=", "threads=", "checkpoint_every=", "logging.", "evaluation.")
+    free = (
+        *("steps=", "device=", "threads=", "backend=", "checkpoint_every="),
+        *("logging.", "evaluation."),
+    )
     for text in changes:
         if not text.startswith(free):
             raise ConfigError(

@@ -28,6 +28,7 @@ ALLOWED = {
 CONFINED = {
     "pybullet": "envs/bullet",
     "escnn": "modules/bases.py",
+    "ctypes": "modules/native",
     "hydra": "config.py",
     "wandb": "training/metrics.py",
     "imageio": "training/video.py",

@@ -67,6 +67,7 @@ def test_group_is_normalised():
         ({"algorithm": {"name": "sac", "target_entropy": float("nan")}}, "target_entropy=nan"),
         ({"algorithm": {"name": "sac", "averaging": 1.0}}, "algorithm.averaging=1.0"),
         ({"steps": 0}, "steps=0"),
+        ({"backend": "fast"}, "backend=fast: expected one of auto, native, dense"),
     ],
 )
 def test_impossible_values_are_named(changes, message):

@@ -1,6 +1,7 @@
 """Steerable layers, the networks built from them, their distribution, and the baseline."""
 
 from .actor import EquivariantPolicy, make_actor
+from .backend import BACKENDS, NativeUnavailable, resolve_backend
 from .cnn import CNNEncoder, make_cnn_actor, make_cnn_critic
 from .critic import EquivariantQHeads, make_critic
 from .distributions import RadialTanhNormal
@@ -11,12 +12,14 @@ from .pooling import GroupMaxPool
 from .steerable import SteerableConv, SteerableLinear
 
 __all__ = [
+    "BACKENDS",
     "CNNEncoder",
     "EquivariantEncoder",
     "EquivariantPolicy",
     "EquivariantQHeads",
     "FieldType",
     "GroupMaxPool",
+    "NativeUnavailable",
     "RadialTanhNormal",
     "SteerableConv",
     "SteerableLinear",
@@ -24,5 +27,6 @@ __all__ = [
     "make_cnn_actor",
     "make_cnn_critic",
     "make_critic",
+    "resolve_backend",
     "shared_filters",
 ]

@@ -31,6 +31,7 @@ class EquivariantPolicy(nn.Module):
             irreducible blocks has one standard deviation, so that x and y share theirs.
             ``"paper"`` (appendix A): theta's mean is an invariant and each of the five
             components has its own standard deviation.
+        backend: Of the encoder: ``"native"``, ``"dense"`` or ``"auto"``, the faster one.
         device: Where the parameters live.
         generator: Source of the initial weights; torch's global one if None.
 
@@ -46,13 +47,19 @@ class EquivariantPolicy(nn.Module):
         hidden: int = 64,
         image_size: int = 128,
         mode: str = "strict",
+        backend: str = "auto",
         device: torch.device | str | None = None,
         generator: torch.Generator | None = None,
     ):
         super().__init__()
         self.out_rep = action_representation(mode)
         self.encoder = EquivariantEncoder(
-            group, hidden=hidden, image_size=image_size, device=device, generator=generator
+            group,
+            hidden=hidden,
+            image_size=image_size,
+            backend=backend,
+            device=device,
+            generator=generator,
         )
         self.in_type = self.encoder.in_type
         group = self.in_type.group
@@ -81,6 +88,7 @@ def make_actor(
     hidden: int = 64,
     image_size: int = 128,
     mode: str = "strict",
+    backend: str = "auto",
     device: torch.device | str | None = None,
     generator: torch.Generator | None = None,
 ) -> ProbabilisticActor:
@@ -108,6 +116,8 @@ def make_actor(
         mode: ``"strict"``: the distribution is exactly equivariant under the physical
             action; x and y are squashed radially onto the unit disc. ``"paper"``: the
             published policy, an elementwise squashed Gaussian with theta an invariant.
+        backend: Of the encoder: ``"native"``, the kernels for CPUs; ``"dense"``, torch's own;
+            ``"auto"``, the faster one. They differ by rounding only, and share parameters.
         device: Where the parameters live; ``"auto"`` for the first GPU if there is one.
         generator: Source of the initial weights, on the CPU; torch's global one if None.
 
@@ -122,6 +132,7 @@ def make_actor(
         hidden=hidden,
         image_size=image_size,
         mode=mode,
+        backend=backend,
         device=device,
         generator=generator,
     )

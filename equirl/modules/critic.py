@@ -78,6 +78,7 @@ def make_critic(
     mode: str = "strict",
     heads: int = 2,
     head_width: int | None = None,
+    backend: str = "auto",
     device: torch.device | str | None = None,
     generator: torch.Generator | None = None,
 ) -> TensorDictSequential:
@@ -100,6 +101,8 @@ def make_critic(
         heads: Number of estimates, which share the encoder.
         head_width: Regular fields of each head's hidden layer; ``hidden`` when None, as in
             the paper. Narrow encoders profit from wider heads, which cost little.
+        backend: Of the encoder: ``"native"``, the kernels for CPUs; ``"dense"``, torch's own;
+            ``"auto"``, the faster one. They differ by rounding only, and share parameters.
         device: Where the parameters live; ``"auto"`` for the first GPU if there is one.
         generator: Source of the initial weights, on the CPU; torch's global one if None.
 
@@ -107,7 +110,12 @@ def make_critic(
         ValueError: An argument is none of the above.
     """
     encoder = EquivariantEncoder(
-        group, hidden=hidden, image_size=image_size, device=device, generator=generator
+        group,
+        hidden=hidden,
+        image_size=image_size,
+        backend=backend,
+        device=device,
+        generator=generator,
     )
     q_heads = EquivariantQHeads(
         encoder.out_type, mode=mode, heads=heads, width=head_width, generator=generator

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from equirl.symmetry import SymmetryGroup
 
+from .backend import resolve_backend
 from .fields import FieldType
 from .layout import check_sizes, pyramid, resolve_device, stack_observation
+from .native import layer as native
 from .steerable import SteerableConv
 
 __all__ = ["EquivariantEncoder"]
@@ -25,15 +29,22 @@ class EquivariantEncoder(nn.Module):
         group: The symmetry group or its name.
         hidden: Number of regular fields of the output, the paper's n.
         image_size: Side of the image: 16, 32, 64, 128 or 256 pixels.
+        backend: ``"native"``, kernels for CPUs that use the symmetry; ``"dense"``, torch's own
+            convolutions; ``"auto"``, the faster one. They share the parameters and differ by
+            rounding only. What the kernels do not serve (a handful of images, float64,
+            gradients for the image, ``vmap``, ``export``) runs dense on either, and hooks on
+            the single layers are not called by the kernels.
         device: Where the parameters live; ``"auto"`` for the first GPU if there is one.
         generator: Source of the initial weights; torch's global one if None.
 
     Attributes:
         in_type: Two trivial fields, depth and flag.
         out_type: ``hidden`` regular fields.
+        backend: ``"native"`` or ``"dense"``.
 
     Raises:
-        ValueError: The group, the width or the image size is not supported.
+        ValueError: The group, the width, the image size or the backend is not supported.
+        NativeUnavailable: ``backend="native"`` cannot be had; a RuntimeError.
     """
 
     def __init__(
@@ -42,12 +53,14 @@ class EquivariantEncoder(nn.Module):
         *,
         hidden: int = 64,
         image_size: int = 128,
+        backend: str = "auto",
         device: torch.device | str | None = None,
         generator: torch.Generator | None = None,
     ):
         super().__init__()
         check_sizes(hidden, image_size)
         group, self.image_size = SymmetryGroup(group), image_size
+        self.backend = resolve_backend(backend, group, resolve_device(device))
         self.in_type = FieldType.trivial(group, 2)
         self.out_type = FieldType.regular(group, hidden)
         # Fields out, padding and whether to pool, layer by layer.
@@ -72,9 +85,13 @@ class EquivariantEncoder(nn.Module):
             Regular fields of shape (*batch, hidden * group order).
         """
         x = stack_observation(depth, holding, self.image_size)
-        for convolution, pool in zip(self.layers, self.pools, strict=True):
-            x = convolution(x)
-            if pool:  # before the ReLU, with which it commutes: a quarter of the work
-                x = F.max_pool2d(x, 2)
-            x = F.relu(x, inplace=True)
+        layers = cast(list[SteerableConv], list(self.layers))
+        if self.backend == "native" and native.runs(layers, x):
+            x = native.encode(layers, self.pools, x)
+        else:
+            for convolution, pool in zip(layers, self.pools, strict=True):
+                x = convolution(x)
+                if pool:  # before the ReLU, with which it commutes: a quarter of the work
+                    x = F.max_pool2d(x, 2)
+                x = F.relu(x, inplace=True)
         return x.reshape(*depth.shape[:-3], self.out_type.size)

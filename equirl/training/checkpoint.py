@@ -17,7 +17,7 @@ __all__ = ["CheckpointError", "check_same_config", "load_checkpoint", "save_chec
 _FORMAT = 1
 
 #: Keys that may change when a run is resumed: none touches what has been learned.
-_FREE_KEYS = ("steps", "device", "threads", "checkpoint_every")
+_FREE_KEYS = ("steps", "device", "threads", "backend", "checkpoint_every")
 _FREE_GROUPS = ("logging.", "evaluation.")
 
 

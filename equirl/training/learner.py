@@ -11,9 +11,17 @@ from torch.optim.swa_utils import AveragedModel
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import SoftUpdate
 
-from equirl.config import Config, flatten
-from equirl.modules import make_actor, make_cnn_actor, make_cnn_critic, make_critic
+from equirl.config import Config, ConfigError, flatten
+from equirl.modules import (
+    NativeUnavailable,
+    make_actor,
+    make_cnn_actor,
+    make_cnn_critic,
+    make_critic,
+    resolve_backend,
+)
 from equirl.objectives import SACLoss
+from equirl.symmetry import SymmetryGroup
 
 from .checkpoint import check_same_config, load_checkpoint
 from .folder import CHECKPOINT, load_run_config
@@ -23,7 +31,11 @@ __all__ = ["Learner", "load_policy", "make_networks"]
 
 
 def make_networks(config: Config) -> tuple[ProbabilisticActor, torch.nn.Module]:
-    """Builds actor and critic of the configured method, initialised from the run's seed."""
+    """Builds actor and critic of the configured method, initialised from the run's seed.
+
+    Raises:
+        ConfigError: A device or a backend that this machine does not have.
+    """
     size: dict[str, Any] = {
         "hidden": config.method.hidden,
         "image_size": config.env.image_size,
@@ -32,7 +44,11 @@ def make_networks(config: Config) -> tuple[ProbabilisticActor, torch.nn.Module]:
     }
     if config.method.name == "cnn":
         return make_cnn_actor(**size), make_cnn_critic(**size)
-    size["mode"] = config.mode
+    try:
+        resolve_backend(config.backend, SymmetryGroup(config.group), config.torch_device)
+    except (ValueError, NativeUnavailable) as error:
+        raise ConfigError(str(error)) from None
+    size |= {"mode": config.mode, "backend": config.backend}
     actor = make_actor(config.group, **size)
     return actor, make_critic(config.group, head_width=config.method.head_width or None, **size)
 
@@ -119,19 +135,22 @@ def _average(actor: ProbabilisticActor, decay: float) -> AveragedModel:
     return AveragedModel(actor, avg_fn=move)
 
 
-def load_policy(folder: Path, device: str | None = None) -> tuple[Config, ProbabilisticActor]:
+def load_policy(
+    folder: Path, device: str | None = None, backend: str | None = None
+) -> tuple[Config, ProbabilisticActor]:
     """The trained policy of a run's folder, with the run's configuration.
 
     Args:
         folder: The run's folder.
         device: Where to put the policy; where it was trained when None.
+        backend: What an equivariant encoder runs on; what it was trained on when None.
 
     Raises:
-        ConfigError: The folder is not that of a run, or the device is not there.
+        ConfigError: The folder is not that of a run, or the device or backend is not there.
         CheckpointError: It holds no readable checkpoint of that configuration.
     """
     config = load_run_config(folder)
-    config.device = device or config.device
+    config.device, config.backend = device or config.device, backend or config.backend
     state = load_checkpoint(folder / CHECKPOINT)
     check_same_config(flatten(config), state["config"], folder / CHECKPOINT)
     learner = Learner(config)

@@ -1,0 +1,328 @@
+"""The native kernels compute what the dense convolutions and escnn compute."""
+
+import copy
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch.func import functional_call, stack_module_state, vmap
+
+from equirl.modules import (
+    EquivariantEncoder,
+    FieldType,
+    NativeUnavailable,
+    SteerableConv,
+    shared_filters,
+)
+from equirl.modules.native import layer as native
+from equirl.modules.native import library
+from equirl.modules.native.spectral import spectral_basis
+from equirl.symmetry import SymmetryGroup
+
+from .test_steerable import randomise, reference
+
+slow = pytest.mark.slow
+GROUPS = ("C4", "D4", "C8", "D8")
+#: For every instruction set, from the least.
+CAPABILITIES = {"baseline": "DEFAULT", "AVX2": "AVX2", "AVX-512": "AVX512"}
+
+try:
+    library.load()
+except library.NativeUnavailable as error:
+    pytest.skip(str(error), allow_module_level=True)
+
+
+@pytest.fixture(params=CAPABILITIES)
+def instruction_set(request, monkeypatch):
+    """Runs a test on the kernels of one instruction set."""
+    names = list(CAPABILITIES)
+    if names.index(request.param) > names.index(library.best_instruction_set()):
+        pytest.skip(f"this processor has no {request.param}")
+    handle = library._open(library.library_path(request.param))
+    monkeypatch.setattr(native, "load", lambda: library.Library(request.param, handle))
+    native._functions.cache_clear()
+    yield request.param
+    native._functions.cache_clear()
+
+
+def make_layer(group, fields_in, fields_out, padding, kind="regular", seed=0):
+    torch.manual_seed(seed)
+    group = SymmetryGroup(group)
+    in_type = getattr(FieldType, kind)(group, fields_in)
+    return randomise(SteerableConv(in_type, FieldType.regular(group, fields_out), padding=padding))
+
+
+def through_kernels(conv, x, pool=False, relu=False):
+    """The layer on images in the usual layout and order of channels."""
+    basis = spectral_basis(conv.in_type.group, conv.in_type.kinds[0])
+    channels = 1
+    if basis.regular:
+        channels, order = basis.order, native.channel_order(conv.in_type)
+        x = x if order is None else x[:, order.argsort()]
+    y = native.conv_block(conv, native.to_blocks(x, channels), pool=pool, relu=relu)
+    y = native.from_blocks(y, len(x))
+    order = native.channel_order(conv.out_type)
+    return y if order is None else y[:, order]
+
+
+def assert_close(actual, expected, tolerance=1e-5):
+    error = (actual.double() - expected.double()).abs().max()
+    assert error <= tolerance * expected.abs().max(), (
+        f"relative error {error / expected.abs().max()}"
+    )
+
+
+#: Fields in, fields out, side, padding: every combination the encoders use at width 8, and
+#: shapes that fill no register tile.
+SHAPES = [
+    ("trivial", 2, 2, 16, 1),
+    ("regular", 1, 2, 16, 1),
+    ("regular", 4, 8, 16, 1),
+    ("regular", 8, 16, 8, 1),
+    ("regular", 16, 8, 8, 0),
+    ("regular", 8, 8, 3, 0),
+    ("regular", 3, 5, 5, 2),
+    ("trivial", 3, 1, 10, 0),
+]
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
+@pytest.mark.parametrize("group", GROUPS)
+def test_a_layer_and_its_gradients_equal_escnn(group, shape):
+    kind, fields_in, fields_out, side, padding = shape
+    conv = make_layer(group, fields_in, fields_out, padding, kind)
+    theirs = reference(conv)
+    x = torch.randn(5, conv.in_type.size, side, side, requires_grad=kind == "regular")
+    y, expected = through_kernels(conv, x), theirs(theirs.in_type(x)).tensor
+    assert_close(y, expected)
+    gradient = torch.randn_like(y)
+    inputs = [x] if x.requires_grad else []
+    ours = torch.autograd.grad(y, [*inputs, conv.weights, conv.bias], gradient)
+    escnns = torch.autograd.grad(expected, [*inputs, theirs.weights, theirs.bias], gradient)
+    for mine, its in zip(ours, escnns, strict=True):
+        assert_close(mine, its)
+
+
+def decided(pre, pool, margin=1e-4):
+    """Where rounding cannot change which pixel is the maximum, nor the sign of the output."""
+    if not pool:
+        return pre.abs() > margin
+    windows = pre.unfold(2, 2, 2).unfold(3, 2, 2).flatten(4).sort(-1).values
+    return (windows[..., 3].abs() > margin) & (windows[..., 3] - windows[..., 2] > margin)
+
+
+@pytest.mark.parametrize("relu", [False, True])
+@pytest.mark.parametrize("pool", [False, True])
+@pytest.mark.parametrize("shape", [SHAPES[0], SHAPES[2], SHAPES[4]], ids=str)
+@pytest.mark.parametrize("group", ["C4", "D4", pytest.param("D8", marks=slow)])
+def test_fused_maximum_and_relu(instruction_set, group, shape, pool, relu):
+    kind, fields_in, fields_out, side, padding = shape
+    conv = make_layer(group, fields_in, fields_out, padding, kind)
+    x = torch.randn(17, conv.in_type.size, side, side, requires_grad=kind == "regular")
+    y = through_kernels(conv, x, pool, relu)
+
+    exact, z = copy.deepcopy(conv).double(), x.detach().double().requires_grad_()
+    pre = exact(z)
+    expected = F.max_pool2d(pre, 2) if pool else pre
+    expected = F.relu(expected) if relu else expected
+    assert_close(y, expected)
+    gradient = torch.randn_like(y) * decided(pre, pool)
+    y.backward(gradient)
+    expected.backward(gradient.double())
+    assert_close(conv.weights.grad, exact.weights.grad)
+    assert_close(conv.bias.grad, exact.bias.grad)
+    if x.requires_grad:
+        assert_close(x.grad, z.grad)
+
+
+def make_encoder(group, hidden=8, image_size=32, backend="native"):
+    generator = torch.Generator().manual_seed(0)
+    encoder = EquivariantEncoder(
+        group, hidden=hidden, image_size=image_size, backend=backend, generator=generator
+    )
+    for layer in encoder.layers:
+        torch.nn.init.normal_(layer.bias, 0, 0.1, generator=generator)
+    return encoder
+
+
+def images(batch, size, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    depth = 0.3 * torch.rand(batch, 1, size, size, generator=generator)
+    return depth, torch.rand(batch, 1, generator=generator).round()
+
+
+@pytest.mark.parametrize(
+    ("hidden", "size"),
+    [
+        (8, 16),
+        (8, 64),
+        pytest.param(8, 128, marks=slow),
+        pytest.param(16, 256, marks=slow),
+        pytest.param(64, 128, marks=slow),
+    ],
+)
+@pytest.mark.parametrize("group", GROUPS)
+def test_an_encoder_equals_the_dense_one(group, hidden, size):
+    fast, dense = make_encoder(group, hidden, size), make_encoder(group, hidden, size, "dense")
+    observation = images(5, size)
+    assert fast.backend == "native" and native.runs(list(fast.layers), observation[0])
+    assert_close(fast(*observation), dense(*observation), 1e-4)
+
+
+def test_gradients_of_an_encoder():
+    fast, dense = make_encoder("D4"), make_encoder("D4", backend="dense").double()
+    observation = images(6, 32)
+    fast(*observation).square().sum().backward()
+    dense(*(x.double() for x in observation)).square().sum().backward()
+    for mine, its in zip(fast.parameters(), dense.parameters(), strict=True):
+        assert_close(mine.grad, its.grad, 1e-4)
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_features_turn_with_the_image(group):
+    encoder, (depth, holding) = make_encoder(group), images(4, 32)
+    features = encoder(depth, holding)
+    for element in encoder.in_type.group.grid_elements:
+        turned = depth.flip(-1) if element.reflected else depth
+        turned = turned.rot90(element.quarter_turns, (-2, -1))
+        expected = encoder.out_type.transform(features, element)
+        assert_close(encoder(turned, holding), expected, 1e-4)
+
+
+def test_bit_for_bit_the_same_on_any_number_of_threads(instruction_set):
+    encoder, observation = make_encoder("D4"), images(40, 32)
+
+    def run(threads):
+        torch.set_num_threads(threads)
+        encoder.zero_grad()
+        features = encoder(*observation)
+        features.square().sum().backward()
+        return [features.detach(), *(p.grad.clone() for p in encoder.parameters())]
+
+    try:
+        first, again, parallel = run(1), run(1), run(3)
+    finally:
+        torch.set_num_threads(1)
+    for a, b, c in zip(first, again, parallel, strict=True):
+        assert torch.equal(a, b) and torch.equal(a, c)
+
+
+def test_an_image_does_not_depend_on_its_batch():
+    encoder, (depth, holding) = make_encoder("D4"), images(37, 32)
+    features = encoder(depth, holding)
+    assert torch.equal(features[20:], encoder(depth[20:], holding[20:]))
+    batched = encoder(depth[:36].view(4, 9, 1, 32, 32), holding[:36].view(4, 9, 1))
+    assert torch.equal(batched.flatten(0, 1), features[:36])
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """Counts the calls of the kernels."""
+    count, encode = [], native.encode
+    monkeypatch.setattr(native, "encode", lambda *args: count.append(1) or encode(*args))
+    return count
+
+
+def test_what_the_kernels_do_not_serve_runs_dense(calls):
+    encoder, (depth, holding) = make_encoder("D4"), images(4, 32)
+    expected = encoder(depth, holding)
+    assert len(calls) == 1
+    encoder(depth[:1], holding[:1])  # one image is faster without them
+    precise = copy.deepcopy(encoder).double()(depth.double(), holding.double())
+    assert precise.dtype == torch.float64
+    seen = depth.clone().requires_grad_()
+    (saliency,) = torch.autograd.grad(encoder(seen, holding).sum(), seen)
+    assert saliency.abs().sum() > 0
+    with torch.autocast("cpu", torch.bfloat16):
+        encoder(depth, holding)
+    parameters, _ = stack_module_state([encoder, copy.deepcopy(encoder)])
+    stacked = vmap(lambda p: functional_call(encoder, p, (depth, holding)))(parameters)
+    exported = torch.export.export(encoder, (depth, holding)).module()(depth, holding)
+    assert len(calls) == 1
+    for other in (stacked[1], exported):
+        assert_close(other, expected, 1e-4)
+
+
+def test_spectral_weights_are_shared_like_filters(calls):
+    encoder, observation = make_encoder("D4"), images(4, 32)
+
+    def gradients():
+        encoder.zero_grad()
+        (encoder(*observation).square().sum() + encoder(*observation).sum()).backward()
+        return [p.grad.clone() for p in encoder.parameters()]
+
+    plain = gradients()
+    with shared_filters():
+        shared = gradients()
+        dense = copy.copy(encoder.layers[0])(torch.randn(1, 2, 8, 8))  # has its own form
+    assert torch.isfinite(dense).all() and len(calls) == 4
+    for a, b in zip(plain, shared, strict=True):
+        assert_close(a, b)
+
+
+@pytest.mark.parametrize("pool", [False, True])
+def test_not_a_number_is_passed_on(instruction_set, pool):
+    conv = make_layer("D4", 2, 2, 1)
+    x = torch.randn(4, 16, 8, 8)
+    x[1, 3, 2, 2] = float("nan")
+    y = through_kernels(conv, x, pool, relu=True)
+    assert y[1].isnan().any() and torch.isfinite(y[[0, 2, 3]]).all()
+
+
+def test_second_derivatives_are_refused_not_wrong():
+    encoder = make_encoder("D4")
+    loss = encoder(*images(4, 32)).square().sum()
+    (gradient,) = torch.autograd.grad(loss, encoder.layers[1].weights, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        gradient.square().sum().backward()
+
+
+@pytest.mark.parametrize(
+    "layer",
+    [
+        lambda: SteerableConv(*[FieldType.regular(SymmetryGroup("C3"), 1)] * 2),
+        lambda: SteerableConv(*[FieldType.regular(SymmetryGroup("D4"), 1)] * 2, kernel_size=5),
+        lambda: SteerableConv(*[FieldType.trivial(SymmetryGroup("D4"), 1)] * 2),
+        lambda: make_layer("D4", 1, 1, 3),
+    ],
+)
+def test_other_layers_are_refused(layer):
+    with pytest.raises(ValueError, match="native kernels serve 3 x 3 convolutions"):
+        native.conv_block(layer(), torch.zeros(1, 1, 8, 8, 8, 16))
+
+
+def test_groups_and_devices_that_are_not_served():
+    with pytest.raises(ValueError, match="quarter turns, not C6"):
+        EquivariantEncoder("C6", hidden=8, image_size=16, backend="native")
+    assert EquivariantEncoder("C6", hidden=8, image_size=16).backend == "dense"
+    with pytest.raises(ValueError, match="serves the CPU, not meta"):
+        EquivariantEncoder("D4", hidden=8, image_size=16, backend="native", device="meta")
+
+
+def test_a_network_without_its_library_says_so(monkeypatch):
+    encoder, observation = make_encoder("D4"), images(4, 32)
+
+    def missing():
+        raise NativeUnavailable("not built")
+
+    monkeypatch.setattr(native, "load", missing)
+    native._functions.cache_clear()
+    with pytest.raises(NativeUnavailable, match="not built"):
+        encoder(*observation)
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+def test_an_expanded_pair_has_the_filter_of_its_weights(mirror):
+    """The spectral weights of cosets, put together, are the dense filter of the larger group."""
+    conv = make_layer("D8" if mirror else "C8", 2, 3, 1)
+    basis = spectral_basis(conv.in_type.group, "regular")
+    spectral = basis.expand(conv.weights.detach(), 3, 2)
+    assert spectral.shape == (6, 4, basis.size)
+    small = make_layer("D4" if mirror else "C4", 4, 6, 1)
+    inverse = torch.linalg.inv(spectral_basis(small.in_type.group, "regular").expansion.double())
+    small.weights.data = (spectral.double() @ inverse).float().flatten()
+    channels = torch.tensor(basis.channels)
+    order = conv.in_type.group.order
+    out = (torch.arange(3)[:, None] * order + channels).flatten()
+    into = (torch.arange(2)[:, None] * order + channels).flatten()
+    assert_close(small.filter(), conv.filter()[out][:, into])
