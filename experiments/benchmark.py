@@ -2,6 +2,8 @@
 
 python experiments/benchmark.py
 python experiments/benchmark.py --only update --threads 2
+python experiments/benchmark.py --only kernels peak threads --threads 1 --repeats 5
+python experiments/benchmark.py --only layers --hidden 16 --image 64 --threads 1
 """
 
 from __future__ import annotations
@@ -11,12 +13,16 @@ import os
 import platform
 import resource
 import statistics
+import sys
 import time
 from collections.abc import Callable
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # before TorchRL is imported
 
+import side_by_side
 import torch
+from side_by_side import available, milliseconds, take_turns
+from tensordict import TensorDictBase
 
 from equirl.collectors import DemonstrationCollector
 from equirl.config import Config, to_config
@@ -34,17 +40,31 @@ def main() -> None:
         "update": update,
         "acting": acting,
         "memory": memory,
+        "layers": side_by_side.layers,
+        "kernels": side_by_side.kernels,
+        "peak": side_by_side.peak,
+        "threads": side_by_side.threads,
     }
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--only", choices=tables, help="one table")
+    parser.add_argument("--only", choices=tables, nargs="+", help="these tables alone")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--steps", type=int, default=1000, help="environment steps to time")
     parser.add_argument("--repeats", type=int, default=15, help="updates to time")
+    beside_escnn = parser.add_argument_group("tables layers, kernels, peak and threads")
+    beside_escnn.add_argument("--group", default="D4")
+    beside_escnn.add_argument("--hidden", type=int, nargs="+", default=[16, 32, 64])
+    beside_escnn.add_argument("--image", type=int, default=128)
+    beside_escnn.add_argument("--batch", type=int, default=64)
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
-    print(f"{platform.processor() or platform.machine()}, {arguments.threads} torch threads\n")
+    sys.stdout.reconfigure(line_buffering=True)  # each row when it is there, in a file too
+    print(
+        f"{platform.processor() or platform.machine()}, {arguments.threads} torch threads, "
+        f"load average {os.getloadavg()[0]:.2f}\n"
+    )
     for name, table in tables.items():
-        if arguments.only in (None, name):
+        if arguments.only is None or name in arguments.only:
+            print(f"## {name}\n")
             table(arguments)
             print()
 
@@ -92,7 +112,7 @@ def update(arguments: argparse.Namespace) -> None:
     print(
         "| group | hidden | image | batch | sample | losses | backward | Adam | target | update |"
     )
-    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
     for group, hidden, size in (("D4", 8, 64), ("D4", 16, 64), ("C4", 16, 64), ("D4", 8, 32)):
         config = _config(group, hidden, size)
         learner, buffer = Learner(config), _filled_buffer(config)
@@ -116,22 +136,24 @@ def update(arguments: argparse.Namespace) -> None:
 
 
 def acting(arguments: argparse.Namespace) -> None:
-    """Milliseconds to choose one action from one observation, filters expanded each time."""
-    print("| group | hidden | image | act ms |")
-    print("| --- | --- | --- | --- |")
+    """Milliseconds to choose one action from one observation, filters expanded each time.
+
+    The native backend leaves so few images to the dense one, so the columns should agree.
+    """
+    backends = available(["dense", "native"])
+    print(f"| group | hidden | image | {' | '.join(f'{name} ms' for name in backends)} |")
+    print("| --- | --- | --- " + "| --- " * len(backends) + "|")
     for group, hidden, size in (("D4", 8, 64), ("D4", 16, 64), ("D4", 64, 128)):
-        config = _config(group, hidden, size)
-        learner = Learner(config)
         env = make_env("block_picking", image_size=size)
         observation = env.reset()
-        times = []
-        for _ in range(arguments.repeats + 2):
-            start = time.perf_counter()
-            with torch.no_grad():
-                learner.actor(observation.copy())
-            times.append(time.perf_counter() - start)
         env.close()
-        print(f"| {group} | {hidden} | {size} | {1e3 * statistics.median(times[2:]):.1f} |")
+        calls = {}
+        for backend in backends:
+            config = _config(group, hidden, size, backend)
+            calls[backend] = _acting(Learner(config).actor, observation)
+        seconds = take_turns(calls, arguments.repeats, warm_up=2)
+        cells = " | ".join(milliseconds(times) for times in seconds.values())
+        print(f"| {group} | {hidden} | {size} | {cells} |")
 
 
 def memory(arguments: argparse.Namespace) -> None:
@@ -156,7 +178,15 @@ class _Clock:
         self.last = time.perf_counter()
 
 
-def _config(group: str, hidden: int, size: int) -> Config:
+def _acting(actor: torch.nn.Module, observation: TensorDictBase) -> Callable[[], None]:
+    def act() -> None:
+        with torch.no_grad():
+            actor(observation.copy())
+
+    return act
+
+
+def _config(group: str, hidden: int, size: int, backend: str = "auto") -> Config:
     return to_config(
         {
             "env": {"task": "block_picking", "image_size": size},
@@ -164,6 +194,7 @@ def _config(group: str, hidden: int, size: int) -> Config:
             "algorithm": {"name": "sac"},
             "augmentation": {"name": "buffer"},
             "group": group,
+            "backend": backend,
         }
     )
 
