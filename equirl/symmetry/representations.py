@@ -118,9 +118,11 @@ class ScalarField:
 
     def rotate(self, image: Tensor, angles: Tensor) -> Tensor:
         """Rotates ``image`` of shape (B, C, S, S) by ``angles`` of shape (B,), in rad."""
-        cos, sin, zero = angles.cos(), angles.sin(), torch.zeros_like(angles)
-        # affine_grid's coordinates are (column, row), that is (y, x); it maps each output
-        # pixel to the input point it came from, so this is the inverse rotation.
-        inverse = torch.stack([cos, -sin, zero, sin, cos, zero], -1).reshape(-1, 2, 3).to(image)
-        grid = F.affine_grid(inverse, list(image.shape), align_corners=False)
+        size = image.shape[-1]
+        centres = (2 * torch.arange(size, device=image.device) + 1 - size).to(image) / size
+        # A point is column + i row, that is y + i x, so that this turns it backwards: each
+        # output pixel asks for the input point it came from.
+        points = torch.complex(*reversed(torch.meshgrid(centres, centres, indexing="ij")))
+        phases = torch.polar(torch.ones_like(angles), angles).to(points)
+        grid = torch.view_as_real(phases[:, None, None] * points)
         return F.grid_sample(image, grid, padding_mode="border", align_corners=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -67,8 +68,19 @@ class SymmetrySpec:
             A new tensordict; undeclared keys are shared with the input.
         """
         out = tensordict.clone(recurse=False)
+        images: dict[tuple, list[tuple[NestedKey, Tensor]]] = {}
         for key, rule, value in self._present(tensordict):
-            out.set(key, rule.rotate(value, angles))
+            if isinstance(rule, ScalarField):
+                images.setdefault((rule, value.shape[-1], value.dtype), []).append((key, value))
+            else:
+                out.set(key, rule.rotate(value, angles))
+        # Images of one size turn together: where to look is worked out once for all of them.
+        for (rule, *_), entries in images.items():
+            keys, values = zip(*entries, strict=True)
+            turned = rule.rotate(torch.cat(values, 1), angles)
+            parts = turned.split([value.shape[1] for value in values], 1)
+            for key, part in zip(keys, parts, strict=True):
+                out.set(key, part)
         return out
 
     def _present(
