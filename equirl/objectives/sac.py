@@ -37,7 +37,8 @@ class SACLoss(TorchRLSACLoss):
         ``loss_qvalue`` (the sum over heads of the mean squared errors), ``loss_alpha``,
         ``alpha`` and ``entropy``; writes ``td_error`` (B,), the mean of the heads'
         absolute errors, into its input. The sum of the three losses can be
-        differentiated at once: each reaches its own parameters only.
+        differentiated at once: each reaches its own parameters only. :meth:`backward`
+        does so with less memory.
 
     Raises:
         TypeError: The critic is not a sequence of an encoder and heads.
@@ -67,6 +68,7 @@ class SACLoss(TorchRLSACLoss):
             # TorchRL would weight the actor's and the temperature's losses as well.
             use_prioritized_weights=False,
         )
+        self._backward_at_once = False
         self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
         # Reading it once turns the lazy attribute into a buffer, part of the state dict.
         _ = self.target_entropy
@@ -88,6 +90,20 @@ class SACLoss(TorchRLSACLoss):
         with shared_filters():
             return super().forward(tensordict)
 
+    def backward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The losses of a batch, their gradients accumulated in the parameters.
+
+        What ``forward`` and a backward pass of the sum of the losses do, but one network
+        after the other, so that the activations of one encoder only are kept at a time.
+        """
+        self._backward_at_once = True
+        try:
+            losses = self(tensordict)
+        finally:
+            self._backward_at_once = False
+        (losses["loss_actor"] + losses["loss_alpha"]).backward()
+        return losses
+
     def qvalue_v2_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Sum over heads of the mean squared Bellman error; keeps the state's features."""
         target = self._compute_target_v2(tensordict)
@@ -99,6 +115,9 @@ class SACLoss(TorchRLSACLoss):
             tensordict.set(key, values.get(key).detach())
         error = values.get(self.tensor_keys.state_action_value) - target.unsqueeze(-1)
         loss = error.pow(2).mean(0).sum()
+        if self._backward_at_once:
+            loss.backward()
+            loss = loss.detach()
         return loss, {"td_error": error.detach().abs().mean(-1)}
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:

@@ -96,9 +96,8 @@ class Learner:
         Returns:
             The losses, temperature and entropy, and the mean absolute Bellman error.
         """
-        losses = self.loss(batch)
         self.optimizer.zero_grad(set_to_none=True)
-        (losses["loss_actor"] + losses["loss_qvalue"] + losses["loss_alpha"]).backward()
+        losses = self.loss.backward(batch)
         self.optimizer.step()
         self.target_update.step()
         if self.average is not None:

@@ -119,6 +119,23 @@ def test_each_loss_reaches_only_its_own_parameters():
         assert all(p.grad is None for p in targets)
 
 
+def test_backward_is_forward_and_one_backward_pass():
+    actor, critic = networks()
+    together, apart = make_loss(actor, critic), make_loss(*copy.deepcopy((actor, critic)))
+    torch.manual_seed(3)
+    expected = together(batch())
+    sum(expected[f"loss_{name}"] for name in ("actor", "qvalue", "alpha")).backward()
+    torch.manual_seed(3)
+    data = batch()
+    losses = apart.backward(data)
+    for key in together.out_keys:
+        torch.testing.assert_close(losses[key], expected[key])
+    assert data["td_error"].shape == (BATCH,)
+    for (name, a), b in zip(together.named_parameters(), apart.parameters(), strict=True):
+        torch.testing.assert_close(a.grad, b.grad, msg=name)
+    assert apart(batch())["loss_qvalue"].requires_grad  # forward is unchanged by it
+
+
 def test_encoder_runs_once_for_state_and_once_for_target():
     actor, critic = networks()
     calls = []
