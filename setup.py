@@ -40,7 +40,7 @@ setup(
     ext_modules=[
         Extension(
             f"equirl.modules.native._{name}",
-            [f"{FOLDER}/{name}.cpp"],
+            [f"{FOLDER}/{name}.cpp", f"{FOLDER}/{name}_one.cpp"],
             depends=[f"{FOLDER}/kernels.hpp", "setup.py"],
             language="c++",
             extra_compile_args=[*FLAGS, *OPENMP, *flags],

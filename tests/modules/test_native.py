@@ -52,14 +52,14 @@ def make_layer(group, fields_in, fields_out, padding, kind="regular", seed=0):
     return randomise(SteerableConv(in_type, FieldType.regular(group, fields_out), padding=padding))
 
 
-def through_kernels(conv, x, pool=False, relu=False):
+def through_kernels(conv, x, pool=False, relu=False, block=native.BLOCK):
     """The layer on images in the usual layout and order of channels."""
     basis = spectral_basis(conv.in_type.group, conv.in_type.kinds[0])
     channels = 1
     if basis.regular:
         channels, order = basis.order, native.channel_order(conv.in_type)
         x = x if order is None else x[:, order.argsort()]
-    y = native.conv_block(conv, native.to_blocks(x, channels), pool=pool, relu=relu)
+    y = native.conv_block(conv, native.to_blocks(x, channels, block), pool=pool, relu=relu)
     y = native.from_blocks(y, len(x))
     order = native.channel_order(conv.out_type)
     return y if order is None else y[:, order]
@@ -135,6 +135,20 @@ def test_fused_maximum_and_relu(instruction_set, group, shape, pool, relu):
         assert_close(x.grad, z.grad)
 
 
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
+@pytest.mark.parametrize("group", GROUPS)
+def test_one_image_at_a_time(instruction_set, group, shape):
+    kind, fields_in, fields_out, side, padding = shape
+    conv = make_layer(group, fields_in, fields_out, padding, kind)
+    x = torch.randn(2, conv.in_type.size, side, side)
+    with torch.no_grad():
+        expected = copy.deepcopy(conv).double()(x.double())
+        assert_close(through_kernels(conv, x, block=1), expected)
+        if expected.shape[-1] % 2 == 0:  # as the maximum asks
+            expected = F.relu(F.max_pool2d(expected, 2))
+            assert_close(through_kernels(conv, x, pool=True, relu=True, block=1), expected)
+
+
 def make_encoder(group, hidden=8, image_size=32, backend="native"):
     generator = torch.Generator().manual_seed(0)
     encoder = EquivariantEncoder(
@@ -151,6 +165,14 @@ def images(batch, size, seed=0):
     return depth, torch.rand(batch, 1, generator=generator).round()
 
 
+@pytest.fixture
+def calls(monkeypatch):
+    """Counts the calls of the kernels."""
+    count, encode = [], native.encode
+    monkeypatch.setattr(native, "encode", lambda *args: count.append(1) or encode(*args))
+    return count
+
+
 @pytest.mark.parametrize(
     ("hidden", "size"),
     [
@@ -162,11 +184,13 @@ def images(batch, size, seed=0):
     ],
 )
 @pytest.mark.parametrize("group", GROUPS)
-def test_an_encoder_equals_the_dense_one(group, hidden, size):
+@pytest.mark.parametrize("batch", [1, 5])
+def test_an_encoder_equals_the_dense_one(group, hidden, size, batch, calls):
     fast, dense = make_encoder(group, hidden, size), make_encoder(group, hidden, size, "dense")
-    observation = images(5, size)
-    assert fast.backend == "native" and native.runs(list(fast.layers), observation[0])
-    assert_close(fast(*observation), dense(*observation), 1e-4)
+    observation = images(batch, size)
+    with torch.no_grad():
+        assert_close(fast(*observation), dense(*observation), 1e-4)
+    assert fast.backend == "native" and len(calls) == 1
 
 
 def test_gradients_of_an_encoder():
@@ -215,19 +239,11 @@ def test_an_image_does_not_depend_on_its_batch():
     assert torch.equal(batched.flatten(0, 1), features[:36])
 
 
-@pytest.fixture
-def calls(monkeypatch):
-    """Counts the calls of the kernels."""
-    count, encode = [], native.encode
-    monkeypatch.setattr(native, "encode", lambda *args: count.append(1) or encode(*args))
-    return count
-
-
 def test_what_the_kernels_do_not_serve_runs_dense(calls):
     encoder, (depth, holding) = make_encoder("D4"), images(4, 32)
     expected = encoder(depth, holding)
     assert len(calls) == 1
-    encoder(depth[:1], holding[:1])  # one image is faster without them
+    encoder(depth[:1], holding[:1]).sum().backward()  # few images with gradients
     precise = copy.deepcopy(encoder).double()(depth.double(), holding.double())
     assert precise.dtype == torch.float64
     seen = depth.clone().requires_grad_()
@@ -260,12 +276,13 @@ def test_spectral_weights_are_shared_like_filters(calls):
         assert_close(a, b)
 
 
+@pytest.mark.parametrize("block", [1, native.BLOCK])
 @pytest.mark.parametrize("pool", [False, True])
-def test_not_a_number_is_passed_on(instruction_set, pool):
-    conv = make_layer("D4", 2, 2, 1)
+def test_not_a_number_is_passed_on(instruction_set, pool, block):
+    conv = make_layer("D4", 2, 2, 1).requires_grad_(block == native.BLOCK)
     x = torch.randn(4, 16, 8, 8)
     x[1, 3, 2, 2] = float("nan")
-    y = through_kernels(conv, x, pool, relu=True)
+    y = through_kernels(conv, x, pool, relu=True, block=block)
     assert y[1].isnan().any() and torch.isfinite(y[[0, 2, 3]]).all()
 
 

@@ -14,7 +14,9 @@
 //
 // Feature maps are stored as [batch / 16][field][row][column][channel of the field][16]:
 // sixteen images side by side, so that every operation is one on vectors and no width leaves
-// a remainder, and the channels that a Fourier transform needs next to one another.
+// a remainder, and the channels that a Fourier transform needs next to one another. A few
+// images would leave those lanes empty: compiled with EQUIRL_ONE_IMAGE, the file gives the
+// forward pass for maps of one image, whose vectors run over the rows of the products.
 
 #include <cstddef>
 #include <cstdint>
@@ -44,6 +46,9 @@ namespace {
 
 // ---- Vectors ----------------------------------------------------------------------------
 
+#if defined(EQUIRL_ONE_IMAGE)
+constexpr int kBlock = 1, kLanes = 1;
+#else
 constexpr int kBlock = 16;  // images side by side in memory
 #if defined(__AVX512F__)
 constexpr int kLanes = 16, kRows = 8, kColumns = 3;  // register tile: 24 of 32 registers
@@ -52,18 +57,38 @@ constexpr int kLanes = 8, kRows = 4, kColumns = 3;  // 12 of 16
 #else
 constexpr int kLanes = 4, kRows = 4, kColumns = 2;
 #endif
+#endif
 constexpr int kSplits = kBlock / kLanes;  // vectors that make up one pixel of a block
 
+#if defined(EQUIRL_ONE_IMAGE)
+typedef float Vec;
+typedef int32_t Mask;
+inline Vec load(const float* p) { return *p; }
+inline void store(float* p, Vec v) { *p = v; }
+inline Mask load_bytes(const uint8_t* p) { return *p; }
+inline void store_bytes(uint8_t* p, Mask v) { *p = uint8_t(v); }
+inline Mask mask(bool condition) { return -Mask(condition); }
+inline Vec keep(Mask mask, Vec v) { return mask ? v : 0; }
+#else
 typedef float Vec __attribute__((vector_size(4 * kLanes)));
 typedef int32_t Mask __attribute__((vector_size(4 * kLanes)));
 typedef uint8_t Bytes __attribute__((vector_size(kLanes)));
-
 inline Vec load(const float* p) {
     Vec v;
     std::memcpy(&v, p, sizeof v);
     return v;
 }
 inline void store(float* p, Vec v) { std::memcpy(p, &v, sizeof v); }
+inline Mask load_bytes(const uint8_t* p) {
+    Bytes bytes;
+    std::memcpy(&bytes, p, sizeof bytes);
+    return __builtin_convertvector(bytes, Mask);
+}
+inline void store_bytes(uint8_t* p, Mask v) {
+    const Bytes bytes = __builtin_convertvector(v, Bytes);
+    std::memcpy(p, &bytes, sizeof bytes);
+}
+inline Mask mask(Mask condition) { return condition; }
 inline Vec keep(Mask mask, Vec v) { return (Vec)(mask & (Mask)v); }
 
 /// Sums over lanes: lane l of the result is the sum of all lanes of v[l].
@@ -83,6 +108,8 @@ inline Vec sums(Vec* v) {
     }
     return v[0];
 }
+
+#endif
 
 /// Memory that a thread keeps between calls; fresh pages cost more than the work on them.
 template <int Purpose>
@@ -137,6 +164,11 @@ struct Spectral {
     int pixels;
     int stride() const { return pixels | 1; }
     int stride2() const { return 2 * pixels | 1; }
+};
+
+/// Distances between rows and between pixels of the product of a matrix of that many rows.
+struct Steps {
+    int row, pixel;
 };
 
 /// One regular field at one pixel: singles, then the vectors' components.
@@ -241,7 +273,7 @@ struct Masked {
                 if (map.inside(i, j)) {
                     const size_t k = map.at(field, i, j);
                     for (int c = 0; c < Channels; ++c)
-                        values[c] = keep(~(load(output + k + c * kBlock) <= 0),
+                        values[c] = keep(~mask(load(output + k + c * kBlock) <= 0),
                                          load(gradient + k + c * kBlock));
                 }
                 use(pixel, values);
@@ -266,17 +298,15 @@ struct Unpooled {
                 if (map.inside(i, j))
                     for (int c = 0; c < Channels; ++c) {
                         const size_t k = map.at(field, i, j) + c * kBlock;
-                        Bytes bytes;
-                        std::memcpy(&bytes, choice + k, sizeof bytes);
                         value[c] = load(gradient + k);
-                        chosen[c] = __builtin_convertvector(bytes, Mask);
+                        chosen[c] = load_bytes(choice + k);
                     }
                 for (int q = 0; q < 4; ++q) {
                     const int row = 2 * i + q / 2, column = 2 * j + q % 2;
                     if (row < tile.row || row >= bottom || column < tile.column || column >= right)
                         continue;
                     Vec values[Channels];
-                    for (int c = 0; c < Channels; ++c) values[c] = keep(chosen[c] == q, value[c]);
+                    for (int c = 0; c < Channels; ++c) values[c] = keep(mask(chosen[c] == q), value[c]);
                     use((row - tile.row) * tile.columns + column - tile.column, values);
                 }
             }
@@ -406,6 +436,61 @@ void spectral_output(const Source& source, const Tile& tile, int fields, const S
 
 // ---- Matrix products ----------------------------------------------------------------------
 
+#if defined(EQUIRL_ONE_IMAGE)
+// One image leaves no lanes to fill: the vectors run over the rows of the matrix instead, and
+// the products are stored pixel by pixel.
+
+constexpr int kWide = 16;
+#if defined(__AVX512F__)
+constexpr int kAtOnce = 8;
+#elif defined(__AVX2__)
+constexpr int kAtOnce = 4;
+#else
+constexpr int kAtOnce = 2;
+#endif
+typedef float Wide __attribute__((vector_size(4 * kWide)));
+
+inline int height_of(int) { return kWide; }
+inline int padded(int m) { return (m + kWide - 1) & ~(kWide - 1); }
+inline Steps steps_of(int m, int) { return {1, padded(m)}; }
+
+/// out[N][16] (+)= weights[K][16] v[K][N], in registers.
+template <int N>
+void product(int k, const float* weights, const Vec* v, int ldv, Vec* out, int ldo, bool add) {
+    Wide sum[N] = {};
+    if (add)
+#pragma GCC unroll 8
+        for (int j = 0; j < N; ++j) std::memcpy(&sum[j], out + j * ldo, sizeof(Wide));
+    for (; k; --k, weights += kWide, v += ldv) {
+        Wide w;
+        std::memcpy(&w, weights, sizeof w);
+#pragma GCC unroll 8
+        for (int j = 0; j < N; ++j) sum[j] += w * v[j];
+    }
+#pragma GCC unroll 8
+    for (int j = 0; j < N; ++j) std::memcpy(out + j * ldo, &sum[j], sizeof(Wide));
+}
+
+template <int N>
+void product_n(int n, int k, const float* w, const Vec* v, int ldv, Vec* o, int ldo, bool add) {
+    for (; n >= N; n -= N, v += N, o += N * ldo) product<N>(k, w, v, ldv, o, ldo, add);
+    if constexpr (N > 1) product_n<N / 2>(n, k, w, v, ldv, o, ldo, add);
+}
+
+/// out[n][m] (+)= the rows [k0, k0 + k) of packed weights [K][m] times v[k][n].
+void multiply(int m, int n, int k, int k0, int K, const float* weights, const Vec* v, int ldv,
+              Vec* out, bool add) {
+    const int ldo = padded(m);
+    if (k == 0 && !add) std::memset(out, 0, size_t(n) * ldo * sizeof(Vec));
+    if (k == 0) return;
+    for (int i = 0; i < m; i += kWide)
+        product_n<kAtOnce>(n, k, weights + size_t(i) * K + size_t(k0) * kWide, v, ldv, out + i,
+                           ldo, add);
+}
+#else
+inline int padded(int m) { return m; }
+inline Steps steps_of(int, int stride) { return {stride, 1}; }
+
 /// out[M][N] (+)= weights[K][M] v[K][N], in registers.
 template <int M, int N>
 void product(int k, const float* weights, const Vec* v, int ldv, Vec* out, int ldo, bool add) {
@@ -454,7 +539,8 @@ void product_n(int n, int k, const float* w, const Vec* v, int ldv, Vec* o, int 
 
 /// out[m][n] (+)= the rows [k0, k0 + k) of packed weights [K][m] times v[k][n].
 void multiply(int m, int n, int k, int k0, int K, const float* weights, const Vec* v, int ldv,
-              Vec* out, int ldo, bool add) {
+              Vec* out, bool add) {
+    const int ldo = ldv;
     if (k == 0) {
         if (!add)
             for (int i = 0; i < m; ++i) std::memset(out + i * ldo, 0, n * sizeof(Vec));
@@ -496,6 +582,8 @@ void correlate(int m, int k, int n, const Vec* a, int lda, const Vec* b, int ldb
         }
 }
 
+#endif
+
 // ---- Layers -----------------------------------------------------------------------------
 
 /// Sizes of one convolution.
@@ -520,7 +608,7 @@ inline Sizes adjoint(const Sizes& s) {
 /// Lays out a spectral tile of `rows` rows per irrep in memory; returns its size in floats.
 inline size_t lay_out(float* memory, int pixels, int singles, const int* single, int vector,
                       Spectral* tile) {
-    constexpr int kSpare = 4;  // correlate() reads whole groups of four rows
+    constexpr int kSpare = 16;  // rows are read, or written, in whole groups
     tile->pixels = pixels;
     size_t used = 0;
     for (int s = 0; s < singles; ++s) {
@@ -575,11 +663,12 @@ void pack(const Sizes& s, const float* weights, float* packed, const float** sin
                 const float* from = weights + size_t(o) * ci * size + offset + c * rows;
                 float* to = packed + size_t(i) * K + h;
                 for (int f = 0; f < ci; ++f, from += size)
-                    for (int r = 0; r < rows; ++r) to[(size_t(f) * rows + r) * height] = from[r];
+                    for (int r = 0; r < rows; ++r)
+                        to[(size_t(f) * rows + r) * height] = i + h < m ? from[r] : 0;
             }
         }
         const float* start = packed;
-        packed += size_t(m) * K;
+        packed += size_t(padded(m)) * K;
         return start;
     };
     int offset = 0;
@@ -591,7 +680,7 @@ void pack(const Sizes& s, const float* weights, float* packed, const float** sin
 /// What becomes of the result of a convolution.
 struct Target {
     float* map;
-    uint8_t* choice;    // of the maximum, 0 to 3, or 4 where the ReLU blocked; for `pool`
+    uint8_t* choice;    // of the maximum, 0 to 3, or 4 where the ReLU blocked; may be null
     const float* bias;  // one per field, or null
     bool pool, relu;
 };
@@ -600,16 +689,19 @@ struct Target {
 template <bool Mirror>
 void finish(const Target& target, const Sizes& s, const Tile& tile, const Spectral& o) {
     using G = Group<Mirror>;
-    const int n = o.pixels, ld = o.stride(), ld2 = o.stride2();
+    const Steps single = steps_of(s.fields_out, o.stride());
+    const Steps vector = steps_of(G::copies * s.fields_out, o.stride2());
     const int shift = target.pool ? 1 : 0;
     const Map<G::order> map = {s.height_out >> shift, s.width_out >> shift};
     const auto field_at = [&](int f, int pixel, Vec* values) {
         Vec parts[G::order];
-        for (int c = 0; c < G::singles; ++c) parts[c] = o.single[c][f * ld + pixel];
+        for (int c = 0; c < G::singles; ++c)
+            parts[c] = o.single[c][f * single.row + pixel * single.pixel];
         if (target.bias) parts[0] += target.bias[f];
         for (int c = 0; c < G::copies; ++c) {
-            const Vec* row = o.vector + size_t(c * s.fields_out + f) * ld2 + pixel;
-            parts[G::singles + 2 * c] = row[0], parts[G::singles + 2 * c + 1] = row[n];
+            const Vec* row = o.vector + (c * s.fields_out + f) * vector.row + pixel * vector.pixel;
+            parts[G::singles + 2 * c] = row[0];
+            parts[G::singles + 2 * c + 1] = row[o.pixels * vector.pixel];
         }
         inverse<Mirror>(parts, values);
     };
@@ -621,7 +713,7 @@ void finish(const Target& target, const Sizes& s, const Tile& tile, const Spectr
                     Vec values[G::order];
                     field_at(f, i * tile.columns + j, values);
                     for (int c = 0; c < G::order; ++c) {
-                        const Vec v = target.relu ? keep(~(values[c] < 0), values[c]) : values[c];
+                        const Vec v = target.relu ? keep(~mask(values[c] < 0), values[c]) : values[c];
                         store(target.map + k + c * kBlock, v);
                     }
                     continue;
@@ -634,18 +726,17 @@ void finish(const Target& target, const Sizes& s, const Tile& tile, const Spectr
                     Mask choice = {};
                     for (int q = 1; q < 4; ++q) {
                         const Vec v = values[q][c];
-                        const Mask better = (v > best) | (v != v);  // not a number wins
+                        const Mask better = mask((v > best) | (v != v));  // not a number wins
                         best = better ? v : best;
                         choice = better ? choice - choice + q : choice;
                     }
                     if (target.relu) {
-                        const Mask dead = best <= 0;
+                        const Mask dead = mask(best <= 0);
                         best = keep(~dead, best);
                         choice = dead ? choice - choice + 4 : choice;
                     }
                     store(target.map + k + c * kBlock, best);
-                    const Bytes bytes = __builtin_convertvector(choice, Bytes);
-                    std::memcpy(target.choice + k + c * kBlock, &bytes, sizeof bytes);
+                    if (target.choice) store_bytes(target.choice + k + c * kBlock, choice);
                 }
             }
 }
@@ -658,7 +749,7 @@ void convolve(const Sizes& s, int blocks, const float* weights, int threads,
               const MakeSource& source_of, const MakeTarget& target_of) {
     using G = Group<Mirror>;
     using R = Rows<Mirror, Regular>;
-    const size_t count = size_t(s.fields_in) * s.fields_out * 6 * G::order;
+    const size_t count = size_t(s.fields_in) * padded(s.fields_out) * 6 * G::order;
     float* packed = scratch<0>(count);
     const float *single[4], *vector;
     pack<Mirror, Regular>(s, weights, packed, single, &vector);
@@ -688,16 +779,17 @@ void convolve(const Sizes& s, int blocks, const float* weights, int threads,
                 for (int c = 0; c < G::singles; ++c)
                     multiply(s.fields_out, n, fields * R::single[c], f * R::single[c],
                              s.fields_in * R::single[c], single[c], v.single[c], v.stride(),
-                             o.single[c], o.stride(), f > 0);
+                             o.single[c], f > 0);
                 multiply(G::copies * s.fields_out, 2 * n, fields * R::vector, f * R::vector,
                          s.fields_in * R::vector, vector, v.vector, v.stride2(), o.vector,
-                         o.stride2(), f > 0);
+                         f > 0);
             }
             finish<Mirror>(target, s, tile, o);
         }
     }
 }
 
+#if !defined(EQUIRL_ONE_IMAGE)
 inline int groups(int rows) { return (rows + 3) / 4; }
 
 /// Gradients of the weights and the bias. Work is divided into a fixed number of parts,
@@ -788,6 +880,8 @@ void correlate_maps(const Sizes& s, int blocks, float* weights, float* bias, int
         irrep(offset[4], R::vector, c, weights + column + c * R::vector, stride);
 }
 
+#endif
+
 /// Where the image lanes of a split start in a map of some fields.
 template <int Channels>
 size_t offset_of(const Map<Channels>& map, int fields, int block, int split) {
@@ -803,7 +897,7 @@ void forward(const Layer& layer, int blocks, const float* x, const float* weight
     const int shift = layer.pool ? 1 : 0;
     const Map<order> out = {s.height_out >> shift, s.width_out >> shift};
     large_pages(y, blocks * out.size(s.fields_out) * sizeof(float));
-    if (layer.pool) large_pages(choice, blocks * out.size(s.fields_out));
+    if (choice) large_pages(choice, blocks * out.size(s.fields_out));
     convolve<Mirror, Regular>(
         s, blocks, weights, threads,
         [&](int block, int split) {
@@ -811,10 +905,19 @@ void forward(const Layer& layer, int blocks, const float* x, const float* weight
         },
         [&](int block, int split) {
             const size_t i = offset_of(out, s.fields_out, block, split);
-            return Target{y + i, choice + i, bias, layer.pool != 0, layer.relu != 0};
+            uint8_t* chosen = choice ? choice + i : nullptr;
+            return Target{y + i, chosen, bias, layer.pool != 0, layer.relu != 0};
         });
 }
 
+inline void call_forward(const Layer& layer, int blocks, const float* x, const float* weights,
+                         const float* bias, float* y, uint8_t* choice, int threads) {
+    const auto d4 = layer.regular ? forward<true, true> : forward<true, false>;
+    const auto c4 = layer.regular ? forward<false, true> : forward<false, false>;
+    (layer.order == 8 ? d4 : c4)(layer, blocks, x, weights, bias, y, choice, threads);
+}
+
+#if !defined(EQUIRL_ONE_IMAGE)
 /// Calls `with` with a function of block and split that gives the gradient before pool and ReLU.
 template <bool Mirror, class With>
 void with_gradient(const Layer& layer, const float* gradient, const float* y,
@@ -869,20 +972,29 @@ void weight_gradient(const Layer& layer, int blocks, const float* x, const float
             gradient_of);
     });
 }
+#endif
 
 }  // namespace
 
 extern "C" {
 
-/// Changes with the signatures below; compared with the number in library.py.
-int32_t equirl_interface() { return 1; }
+#if defined(EQUIRL_ONE_IMAGE)
 
-/// y = pool(relu(conv(x) + bias)); `choice` is written where `pool` is set.
+/// equirl_forward() for maps that hold one image each instead of sixteen; no choices.
+void equirl_forward_one(const Layer* layer, int32_t images, const float* x, const float* weights,
+                        const float* bias, float* y, int32_t threads) {
+    call_forward(*layer, images, x, weights, bias, y, nullptr, threads);
+}
+
+#else
+
+/// Changes with the signatures of this file; compared with the number in library.py.
+int32_t equirl_interface() { return 2; }
+
+/// y = pool(relu(conv(x) + bias)); with `pool`, `choice` is written unless it is null.
 void equirl_forward(const Layer* layer, int32_t blocks, const float* x, const float* weights,
                     const float* bias, float* y, uint8_t* choice, int32_t threads) {
-    const auto call = layer->order == 8 ? (layer->regular ? forward<true, true> : forward<true, false>)
-                                        : (layer->regular ? forward<false, true> : forward<false, false>);
-    call(*layer, blocks, x, weights, bias, y, choice, threads);
+    call_forward(*layer, blocks, x, weights, bias, y, choice, threads);
 }
 
 /// The gradient of x, for regular input; `weights` are those of the adjoint convolution.
@@ -897,10 +1009,11 @@ void equirl_input_gradient(const Layer* layer, int32_t blocks, const float* grad
 void equirl_weight_gradient(const Layer* layer, int32_t blocks, const float* x,
                             const float* gradient, const float* y, const uint8_t* choice,
                             float* weights, float* bias, int32_t threads) {
-    const auto call =
-        layer->order == 8 ? (layer->regular ? weight_gradient<true, true> : weight_gradient<true, false>)
-                          : (layer->regular ? weight_gradient<false, true> : weight_gradient<false, false>);
-    call(*layer, blocks, x, gradient, y, choice, weights, bias, threads);
+    const auto d4 = layer->regular ? weight_gradient<true, true> : weight_gradient<true, false>;
+    const auto c4 = layer->regular ? weight_gradient<false, true> : weight_gradient<false, false>;
+    (layer->order == 8 ? d4 : c4)(*layer, blocks, x, gradient, y, choice, weights, bias, threads);
 }
+
+#endif
 
 }  // extern "C"

@@ -31,7 +31,7 @@ __all__ = [
 #: Images side by side in memory; a batch is padded to a multiple.
 BLOCK = 16
 
-#: Fewer images than this are faster on the dense backend, whose work shrinks with them.
+#: From this many images on, sixteen lanes are faster than one image after the other.
 SMALLEST_BATCH = 4
 
 
@@ -71,12 +71,14 @@ def runs(layers: Iterable[SteerableConv], x: Tensor) -> bool:
     """Whether the kernels can take a batch of images (B, C, H, W) through supported layers.
 
     They compute in float32 on the CPU, without a gradient for the images, outside of
-    ``vmap``, ``torch.func`` and compilation. A few images are faster without them.
+    ``vmap``, ``torch.func`` and compilation; for few images without gradients at all.
     """
     tensors = [x, *(layer.weights for layer in layers)]
+    few = len(x) < SMALLEST_BATCH
     return (
-        len(x) >= SMALLEST_BATCH
+        len(x) > 0
         and not x.requires_grad
+        and not (few and torch.is_grad_enabled() and any(t.requires_grad for t in tensors))
         and all(t.dtype is torch.float32 and t.device.type == "cpu" for t in tensors)
         and not torch.compiler.is_compiling()
         and not torch.is_autocast_enabled("cpu")
@@ -102,7 +104,7 @@ def encode(layers: Sequence[SteerableConv], pools: Sequence[bool], x: Tensor) ->
     Returns:
         Shape (B, out channels, H', W'), channels in the order of the last layer's fields.
     """
-    batch, x = len(x), to_blocks(x)
+    batch, x = len(x), to_blocks(x, block=BLOCK if len(x) >= SMALLEST_BATCH else 1)
     for layer, pool in zip(layers, pools, strict=True):
         x = conv_block(layer, x, pool=pool, relu=True)
     order = channel_order(layers[-1].out_type)
@@ -125,20 +127,21 @@ def channel_order(fields: FieldType) -> Tensor | None:
     return (starts[:, None] + inverse).flatten()
 
 
-def to_blocks(x: Tensor, channels: int = 1) -> Tensor:
+def to_blocks(x: Tensor, channels: int = 1, block: int = BLOCK) -> Tensor:
     """Arranges feature maps as the kernels want them.
 
     Args:
         x: Shape (B, fields * channels, H, W).
         channels: Channels of a field.
+        block: Images side by side: 16, or 1 for a few images without gradients.
 
     Returns:
-        Shape (ceil(B / 16), fields, H, W, channels, 16), filled up with zeros.
+        Shape (ceil(B / block), fields, H, W, channels, block), filled up with zeros.
     """
-    missing = -len(x) % BLOCK
+    missing = -len(x) % block
     if missing:
         x = F.pad(x, (0, 0, 0, 0, 0, 0, 0, missing))
-    x = x.unflatten(1, (-1, channels)).unflatten(0, (-1, BLOCK))
+    x = x.unflatten(1, (-1, channels)).unflatten(0, (-1, block))
     return x.permute(0, 2, 4, 5, 3, 1).contiguous()
 
 
@@ -170,39 +173,52 @@ def conv_block(conv: SteerableConv, x: Tensor, pool: bool = False, relu: bool = 
     )
     shifts = x.new_zeros(fields_out) if conv.bias is None else conv.bias
     bias = (shifts * conv.in_type.group.order**-0.5).repeat_interleave(basis.cosets)
-    return _ConvBlock.apply(x, weights, bias, basis, conv.padding, pool, relu)
+    inputs = x.contiguous(), weights.contiguous(), bias.contiguous()
+    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
+        return _ConvBlock.apply(*inputs, basis, conv.padding, pool, relu)
+    return _forward(*inputs, basis, conv.padding, pool, relu, keep_choice=False)[0]
+
+
+def _forward(
+    x: Tensor,
+    weights: Tensor,
+    bias: Tensor,
+    basis: SpectralBasis,
+    padding: int,
+    pool: bool,
+    relu: bool,
+    keep_choice: bool,
+) -> tuple[Tensor, Tensor | None, _Layer]:
+    """The output, which pixel was the maximum if that is to be kept, and the layer."""
+    blocks, _, height, width, _, block = x.shape
+    fields_out, fields_in, _ = weights.shape
+    layer = _Layer(
+        basis.order, basis.regular, fields_in, fields_out, height, width,
+        padding, pool, relu, basis.edge, basis.axis,
+    )  # fmt: skip
+    high, wide = (size - 2 + 2 * padding for size in (height, width))
+    if pool:
+        high, wide = high // 2, wide // 2
+    y = x.new_empty(blocks, fields_out, high, wide, basis.order, block)
+    choice = torch.empty(y.shape, dtype=torch.uint8) if pool and keep_choice else None
+    start = [ctypes.byref(layer), blocks]
+    start += [tensor.data_ptr() for tensor in (x, weights, bias, y)]
+    if block == 1:
+        _functions().equirl_forward_one(*start, torch.get_num_threads())
+    else:
+        _functions().equirl_forward(*start, _address(choice), torch.get_num_threads())
+    return y, choice, layer
+
+
+def _address(tensor: Tensor | None) -> int | None:
+    return None if tensor is None else tensor.data_ptr()
 
 
 class _ConvBlock(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any,
-        x: Tensor,
-        weights: Tensor,
-        bias: Tensor,
-        basis: SpectralBasis,
-        padding: int,
-        pool: bool,
-        relu: bool,
-    ) -> Tensor:
-        blocks, _, height, width, _, _ = x.shape
-        fields_out, fields_in, _ = weights.shape
-        layer = _Layer(
-            basis.order, basis.regular, fields_in, fields_out, height, width,
-            padding, pool, relu, basis.edge, basis.axis,
-        )  # fmt: skip
-        high, wide = (size - 2 + 2 * padding for size in (height, width))
-        if pool:
-            high, wide = high // 2, wide // 2
-        shape = (blocks, fields_out, high, wide, basis.order, BLOCK)
-        y = x.new_empty(shape)
-        choice = torch.empty(shape if pool else 0, dtype=torch.uint8)
-        x, weights, bias = x.contiguous(), weights.contiguous(), bias.contiguous()
-        _functions().equirl_forward(
-            ctypes.byref(layer), blocks, x.data_ptr(), weights.data_ptr(), bias.data_ptr(),
-            y.data_ptr(), choice.data_ptr(), torch.get_num_threads(),
-        )  # fmt: skip
-        ctx.layer, ctx.basis = layer, basis
+    def forward(ctx: Any, *arguments: Any) -> Tensor:
+        x, weights, _, ctx.basis, _, pool, relu = arguments
+        y, choice, ctx.layer = _forward(*arguments, keep_choice=True)
         ctx.save_for_backward(x, weights, y if relu and not pool else None, choice)
         return y
 
@@ -211,7 +227,7 @@ class _ConvBlock(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         x, weights, y, choice = ctx.saved_tensors
         gradient = gradient.contiguous()
-        common = (gradient.data_ptr(), y.data_ptr() if y is not None else None, choice.data_ptr())
+        common = gradient.data_ptr(), _address(y), _address(choice)
         layer, blocks, threads = ctypes.byref(ctx.layer), len(x), torch.get_num_threads()
         dx = dw = db = None
         if ctx.needs_input_grad[0]:
@@ -231,6 +247,7 @@ class _ConvBlock(torch.autograd.Function):
 def _functions() -> ctypes.CDLL:
     handle = load().handle
     for name, pointers in (
+        ("equirl_forward_one", 4),
         ("equirl_forward", 5),
         ("equirl_input_gradient", 5),
         ("equirl_weight_gradient", 6),

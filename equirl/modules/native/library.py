@@ -18,7 +18,7 @@ INSTRUCTION_SETS = {"AVX-512": "_avx512", "AVX2": "_avx2", "baseline": "_plain"}
 
 
 #: Number of the functions' signatures, the same as in kernels.hpp.
-INTERFACE = 1
+INTERFACE = 2
 
 
 class NativeUnavailable(RuntimeError):
