@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModule
 from equirl.collectors import DemonstrationError, OnlineCollector
 from equirl.envs import make_env, make_expert
 from equirl.modules import make_actor, make_cnn_actor, shared_filters
+from equirl.modules.native.spectral import SpectralBasis
 from equirl.modules.steerable import _Steerable
 from equirl.training import (
     CheckpointError,
@@ -190,10 +191,13 @@ def test_filters_are_expanded_once_a_step(tmp_path, small_config, monkeypatch):
     run._collect_demonstrations()
     run.step = 1
     expanded = []
-    expand = _Steerable._expand
-    monkeypatch.setattr(
-        _Steerable, "_expand", lambda self, w: expanded.append(w.data_ptr()) or expand(self, w)
-    )
+    for form, name in ((_Steerable, "_expand"), (SpectralBasis, "expand")):
+
+        def counted(self, weights, *sizes, expand=form.__dict__[name]):
+            expanded.append(weights.data_ptr())
+            return expand(self, weights, *sizes)
+
+        monkeypatch.setattr(form, name, counted)
     with shared_filters():
         run._step()
     layers = sum(isinstance(m, _Steerable) for m in run.learner.loss.actor_network.modules())

@@ -73,17 +73,15 @@ def runs(layers: Iterable[SteerableConv], x: Tensor) -> bool:
     They compute in float32 on the CPU, without a gradient for the images, outside of
     ``vmap``, ``torch.func`` and compilation; for few images without gradients at all.
     """
+    if torch.compiler.is_compiling() or torch.is_autocast_enabled("cpu") or x.requires_grad:
+        return False
     tensors = [x, *(layer.weights for layer in layers)]
-    few = len(x) < SMALLEST_BATCH
-    return (
-        len(x) > 0
-        and not x.requires_grad
-        and not (few and torch.is_grad_enabled() and any(t.requires_grad for t in tensors))
-        and all(t.dtype is torch.float32 and t.device.type == "cpu" for t in tensors)
-        and not torch.compiler.is_compiling()
-        and not torch.is_autocast_enabled("cpu")
-        and all(_has_memory(t) for t in tensors)
-    )
+    if not all(
+        t.dtype is torch.float32 and t.device.type == "cpu" and _has_memory(t) for t in tensors
+    ):
+        return False
+    learning = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
+    return len(x) >= (SMALLEST_BATCH if learning else 1)
 
 
 def _has_memory(tensor: Tensor) -> bool:
