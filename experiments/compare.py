@@ -52,7 +52,8 @@ def summary(label: str, folder: Path) -> dict[str, str | int]:
     successes, episodes = int(sum(test["success"])), len(test["success"])
     low, high = wilson_interval(successes, episodes)
     pairs = zip(validation["step"], validation["success_rate"], strict=True)
-    first = next((f"{step:.0f}" for step, rate in pairs if rate >= 0.9), "-")
+    first = next((step for step, rate in pairs if rate >= 0.9), None)
+    minutes = dict(zip(timing["step"], timing["minutes"], strict=True)) if timing else {}
     solved = [n for n, success in zip(test["length"], test["success"], strict=True) if success]
     return {
         "method": label,
@@ -60,7 +61,8 @@ def summary(label: str, folder: Path) -> dict[str, str | int]:
         "success": f"{successes}/{episodes}",
         "95 % interval": f"{low:.0%} to {high:.0%}",
         "mean length of a success": f"{sum(solved) / len(solved):.1f}" if solved else "-",
-        "first validation of 90 %": first,
+        "first validation of 90 %": f"{first:.0f}" if first is not None else "-",
+        "minutes to it": f"{minutes[first]:.1f}" if first in minutes else "-",
         "minutes": f"{timing['minutes'][-1]:.1f}" if timing else "-",
         "update ms": f"{timing['update_ms'][-1]:.0f}" if timing else "-",
     }
