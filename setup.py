@@ -29,6 +29,11 @@ INSTRUCTION_SETS = {
 class BuildKernels(build_ext):
     """Leaves no library of an earlier source behind where the present one does not compile."""
 
+    def build_extension(self, extension: Extension) -> None:
+        """Compiles anew, also after a build that left its results in the build folder."""
+        Path(self.get_ext_fullpath(extension.name)).unlink(missing_ok=True)
+        super().build_extension(extension)
+
     def copy_extensions_to_source(self) -> None:
         """Replaces the libraries in the source tree, as an editable installation wants them."""
         for extension in self.extensions:
@@ -41,7 +46,7 @@ setup(
         Extension(
             f"equirl.modules.native._{name}",
             [f"{FOLDER}/{name}.cpp", f"{FOLDER}/{name}_one.cpp"],
-            depends=[f"{FOLDER}/kernels.hpp", "setup.py"],
+            depends=[*map(str, Path(FOLDER).glob("*.hpp")), "setup.py"],
             language="c++",
             extra_compile_args=[*FLAGS, *OPENMP, *flags],
             # Its own functions first, should another library have one of the same name.

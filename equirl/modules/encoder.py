@@ -31,9 +31,9 @@ class EquivariantEncoder(nn.Module):
         image_size: Side of the image: 16, 32, 64, 128 or 256 pixels.
         backend: ``"native"``, kernels for CPUs that use the symmetry; ``"dense"``, torch's own
             convolutions; ``"auto"``, the faster one. They share the parameters and differ by
-            rounding only. What the kernels do not serve (a handful of images, float64,
-            gradients for the image, ``vmap``, ``export``) runs dense on either, and hooks on
-            the single layers are not called by the kernels.
+            rounding only. What the kernels do not serve (float64, gradients for the image,
+            ``vmap``, forward-mode differentiation, tracing, ``export``) runs dense on
+            either, and hooks on the single layers are not called by the kernels.
         device: Where the parameters live; ``"auto"`` for the first GPU if there is one.
         generator: Source of the initial weights; torch's global one if None.
 

@@ -119,10 +119,11 @@ class ScalarField:
     def rotate(self, image: Tensor, angles: Tensor) -> Tensor:
         """Rotates ``image`` of shape (B, C, S, S) by ``angles`` of shape (B,), in rad."""
         size = image.shape[-1]
+        if image.shape[-2] != size:
+            raise ValueError(f"expected square images (B, C, S, S), got {tuple(image.shape)}")
         centres = (2 * torch.arange(size, device=image.device) + 1 - size).to(image) / size
-        # A point is column + i row, that is y + i x, so that this turns it backwards: each
-        # output pixel asks for the input point it came from.
-        points = torch.complex(*reversed(torch.meshgrid(centres, centres, indexing="ij")))
-        phases = torch.polar(torch.ones_like(angles), angles).to(points)
-        grid = torch.view_as_real(phases[:, None, None] * points)
+        row, column = centres[:, None], centres
+        cos, sin = (part.to(image)[:, None, None] for part in (angles.cos(), angles.sin()))
+        # The inverse rotation: each output pixel asks for the input point it came from.
+        grid = torch.stack([cos * column - sin * row, sin * column + cos * row], -1)
         return F.grid_sample(image, grid, padding_mode="border", align_corners=False)

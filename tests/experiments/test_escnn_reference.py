@@ -16,7 +16,7 @@ PATH = Path(__file__).parents[2] / "experiments" / "escnn_reference.py"
 SPEC = importlib.util.spec_from_file_location("escnn_reference", PATH)
 reference = importlib.util.module_from_spec(SPEC)
 SPEC.loader.exec_module(reference)
-BATCH, IMAGE = 8, 32  # as few as the native kernels take
+BATCH, IMAGE = 8, 32
 
 
 def batch() -> TensorDict:

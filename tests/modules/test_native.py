@@ -1,10 +1,12 @@
 """The native kernels compute what the dense convolutions and escnn compute."""
 
 import copy
+import warnings
 
 import pytest
 import torch
 import torch.nn.functional as F
+from torch.autograd import forward_ad
 from torch.func import functional_call, stack_module_state, vmap
 
 from equirl.modules import (
@@ -243,7 +245,6 @@ def test_what_the_kernels_do_not_serve_runs_dense(calls):
     encoder, (depth, holding) = make_encoder("D4"), images(4, 32)
     expected = encoder(depth, holding)
     assert len(calls) == 1
-    encoder(depth[:1], holding[:1]).sum().backward()  # few images with gradients
     precise = copy.deepcopy(encoder).double()(depth.double(), holding.double())
     assert precise.dtype == torch.float64
     seen = depth.clone().requires_grad_()
@@ -251,12 +252,50 @@ def test_what_the_kernels_do_not_serve_runs_dense(calls):
     assert saliency.abs().sum() > 0
     with torch.autocast("cpu", torch.bfloat16):
         encoder(depth, holding)
+    with warnings.catch_warnings(), forward_ad.dual_level():
+        warnings.simplefilter("ignore")  # both load what is deprecated, and still in use
+        tangent = forward_ad.make_dual(depth, torch.ones_like(depth))
+        assert forward_ad.unpack_dual(encoder(tangent, holding)).tangent is not None
+        traced = torch.jit.trace(encoder, (depth, holding))(depth, holding)
     parameters, _ = stack_module_state([encoder, copy.deepcopy(encoder)])
     stacked = vmap(lambda p: functional_call(encoder, p, (depth, holding)))(parameters)
     exported = torch.export.export(encoder, (depth, holding)).module()(depth, holding)
     assert len(calls) == 1
-    for other in (stacked[1], exported):
+    for other in (stacked[1], exported, traced):
         assert_close(other, expected, 1e-4)
+
+
+@pytest.mark.parametrize("batch", [1, 3, 5])
+@pytest.mark.parametrize("frozen", ["weights", "bias"])
+def test_frozen_parameters(batch, frozen):
+    encoder, observation = make_encoder("D4"), images(batch, 32)
+    encoder(*observation).square().sum().backward()
+    expected = {name: p.grad.clone() for name, p in encoder.named_parameters()}
+    encoder.zero_grad()
+    for name, parameter in encoder.named_parameters():
+        parameter.requires_grad_(frozen not in name)
+    encoder(*observation).square().sum().backward()
+    for name, parameter in encoder.named_parameters():
+        if frozen in name:
+            assert parameter.grad is None
+        else:
+            assert torch.equal(parameter.grad, expected[name])
+
+
+@pytest.mark.parametrize("context", [torch.inference_mode, lambda: torch.device("meta")])
+def test_what_is_made_at_first_use_serves_everywhere(context):
+    caches = spectral_basis, native.channel_order
+    for cache in caches:
+        cache.cache_clear()
+    try:
+        encoder, observation = make_encoder("C8"), images(4, 32)
+        with context():
+            encoder(*observation)
+        encoder(*observation).sum().backward()
+        assert all(torch.isfinite(p.grad).all() for p in encoder.parameters())
+    finally:
+        for cache in caches:
+            cache.cache_clear()
 
 
 def test_spectral_weights_are_shared_like_filters(calls):
@@ -270,7 +309,7 @@ def test_spectral_weights_are_shared_like_filters(calls):
     plain = gradients()
     with shared_filters():
         shared = gradients()
-        dense = copy.copy(encoder.layers[0])(torch.randn(1, 2, 8, 8))  # has its own form
+        dense = encoder.layers[0](torch.randn(1, 2, 8, 8))  # has its own form
     assert torch.isfinite(dense).all() and len(calls) == 4
     for a, b in zip(plain, shared, strict=True):
         assert_close(a, b)
@@ -306,6 +345,33 @@ def test_second_derivatives_are_refused_not_wrong():
 def test_other_layers_are_refused(layer):
     with pytest.raises(ValueError, match="native kernels serve 3 x 3 convolutions"):
         native.conv_block(layer(), torch.zeros(1, 1, 8, 8, 8, 16))
+
+
+@pytest.mark.parametrize(
+    ("shape", "options", "message"),
+    [
+        ((1, 2, 7, 8, 8, 16), {"pool": True}, r"\(7, 8\) pixels .* expected even"),
+        ((1, 3, 8, 8, 8, 16), {}, r"expected maps \(blocks, 2, H, W, 8, 16\), got \(1, 3,"),
+        ((1, 2, 8, 8, 8, 1), {}, r"expected maps \(blocks, 2, H, W, 8, 16\)"),
+        ((1, 2, 8, 8, 4, 16), {}, "expected maps"),
+        ((2, 16, 8, 8), {}, "expected maps"),
+    ],
+)
+def test_maps_of_another_shape_are_refused(shape, options, message):
+    with pytest.raises(ValueError, match=message):
+        native.conv_block(make_layer("D4", 2, 2, 1), torch.zeros(shape), **options)
+
+
+def test_values_the_kernels_cannot_read_are_refused():
+    x = torch.zeros(1, 2, 8, 8, 8, 16)
+    with pytest.raises(ValueError, match="maps in float32 on the CPU, got torch.float64"):
+        native.conv_block(make_layer("D4", 2, 2, 1), x.double())
+    with pytest.raises(ValueError, match="expected at least 1"):
+        native.conv_block(make_layer("D4", 2, 2, 0), x[:, :, :2])
+    conv = make_layer("D4", 2, 2, 1)
+    conv.bias = torch.nn.Parameter(torch.zeros(1))
+    with pytest.raises(ValueError, match="expected 2 biases, got 1"):
+        native.conv_block(conv, x)
 
 
 def test_groups_and_devices_that_are_not_served():

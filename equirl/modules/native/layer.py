@@ -10,13 +10,14 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.autograd import forward_ad
 from torch.autograd.function import once_differentiable
 
 from ..fields import FieldType
 from ..filters import expanded_filter
 from ..steerable import SteerableConv
 from .library import load
-from .spectral import SpectralBasis, spectral_basis
+from .spectral import SpectralBasis, plain_tensors, spectral_basis
 
 __all__ = [
     "BLOCK",
@@ -31,7 +32,7 @@ __all__ = [
 #: Images side by side in memory; a batch is padded to a multiple.
 BLOCK = 16
 
-#: From this many images on, sixteen lanes are faster than one image after the other.
+#: Without gradients, sixteen lanes are faster than one image after the other from here on.
 SMALLEST_BATCH = 4
 
 
@@ -71,17 +72,21 @@ def runs(layers: Iterable[SteerableConv], x: Tensor) -> bool:
     """Whether the kernels can take a batch of images (B, C, H, W) through supported layers.
 
     They compute in float32 on the CPU, without a gradient for the images, outside of
-    ``vmap``, ``torch.func`` and compilation; for few images without gradients at all.
+    ``vmap``, ``torch.func``, forward-mode differentiation, tracing and compilation.
     """
-    if torch.compiler.is_compiling() or torch.is_autocast_enabled("cpu") or x.requires_grad:
-        return False
-    tensors = [x, *(layer.weights for layer in layers)]
-    if not all(
-        t.dtype is torch.float32 and t.device.type == "cpu" and _has_memory(t) for t in tensors
+    if (
+        x.requires_grad
+        or torch.compiler.is_compiling()
+        or torch.jit.is_tracing()
+        or torch.is_autocast_enabled("cpu")
+        or forward_ad._current_level >= 0
     ):
         return False
-    learning = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
-    return len(x) >= (SMALLEST_BATCH if learning else 1)
+    parameters = [p for layer in layers for p in (layer.weights, layer.bias) if p is not None]
+    return len(x) > 0 and all(
+        t.dtype is torch.float32 and t.device.type == "cpu" and _has_memory(t)
+        for t in (x, *parameters)
+    )
 
 
 def _has_memory(tensor: Tensor) -> bool:
@@ -102,7 +107,10 @@ def encode(layers: Sequence[SteerableConv], pools: Sequence[bool], x: Tensor) ->
     Returns:
         Shape (B, out channels, H', W'), channels in the order of the last layer's fields.
     """
-    batch, x = len(x), to_blocks(x, block=BLOCK if len(x) >= SMALLEST_BATCH else 1)
+    parameters = [p for layer in layers for p in (layer.weights, layer.bias) if p is not None]
+    learning = torch.is_grad_enabled() and any(p.requires_grad for p in parameters)
+    batch, block = len(x), BLOCK if learning or len(x) >= SMALLEST_BATCH else 1
+    x = to_blocks(x, block=block)
     for layer, pool in zip(layers, pools, strict=True):
         x = conv_block(layer, x, pool=pool, relu=True)
     order = channel_order(layers[-1].out_type)
@@ -120,9 +128,10 @@ def channel_order(fields: FieldType) -> Tensor | None:
     assert basis is not None
     if basis.cosets == 1:
         return None
-    inverse = torch.tensor(basis.channels).argsort()
-    starts = torch.arange(0, fields.size, fields.group.order)
-    return (starts[:, None] + inverse).flatten()
+    with plain_tensors():
+        inverse = torch.tensor(basis.channels).argsort()
+        starts = torch.arange(0, fields.size, fields.group.order)
+        return (starts[:, None] + inverse).flatten()
 
 
 def to_blocks(x: Tensor, channels: int = 1, block: int = BLOCK) -> Tensor:
@@ -151,30 +160,71 @@ def from_blocks(x: Tensor, batch: int) -> Tensor:
 def conv_block(conv: SteerableConv, x: Tensor, pool: bool = False, relu: bool = False) -> Tensor:
     """A steerable convolution, then optionally a 2 x 2 maximum, then optionally a ReLU.
 
-    Differentiable once, with respect to the input if its fields are regular, the weights
-    and the bias. The result does not depend on the number of threads.
+    Differentiable once in reverse mode, with respect to the input if its fields are regular,
+    the weights and the bias, for blocks of 16. The result does not depend on the number of
+    threads.
 
     Args:
         conv: The layer; its parameters are read, possibly swapped in functionally.
-        x: Blocks of maps, float32, see :func:`to_blocks`: trivial fields of one channel, or
-            regular fields of the subgroup in the kernels' order, see :func:`channel_order`.
+        x: Blocks of maps (blocks, fields, H, W, channels, 16 or 1), float32, see
+            :func:`to_blocks`: trivial fields of one channel, or regular fields of the
+            subgroup in the kernels' order, see :func:`channel_order`.
         pool: Whether to take the maximum; the convolution's height and width must be even.
         relu: Whether to apply the ReLU.
 
     Returns:
-        Blocks of maps, regular fields of the subgroup in the kernels' order.
+        Blocks of maps (blocks, fields out, H', W', channels, 16 or 1), regular fields of the
+        subgroup in the kernels' order.
+
+    Raises:
+        ValueError: The kernels do not serve the layer, or a shape or dtype is not as above.
     """
     basis = _basis_of(conv)
     fields_out, fields_in = len(conv.out_type.fields), len(conv.in_type.fields)
     weights = expanded_filter(
         conv, conv.weights, lambda w: basis.expand(w, fields_out, fields_in), form="spectral"
     )
-    shifts = x.new_zeros(fields_out) if conv.bias is None else conv.bias
+    shifts = weights.new_zeros(fields_out) if conv.bias is None else conv.bias
     bias = (shifts * conv.in_type.group.order**-0.5).repeat_interleave(basis.cosets)
     inputs = x.contiguous(), weights.contiguous(), bias.contiguous()
-    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
+    learning = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs)
+    _check(basis, *inputs, conv.padding, pool, blocks=(BLOCK,) if learning else (BLOCK, 1))
+    if learning:
         return _ConvBlock.apply(*inputs, basis, conv.padding, pool, relu)
     return _forward(*inputs, basis, conv.padding, pool, relu, keep_choice=False)[0]
+
+
+def _check(
+    basis: SpectralBasis,
+    x: Tensor,
+    weights: Tensor,
+    bias: Tensor,
+    padding: int,
+    pool: bool,
+    blocks: tuple[int, ...],
+) -> None:
+    """Refuses what the kernels would read or write out of bounds."""
+    fields_out, fields_in, _ = weights.shape
+    channels = basis.order if basis.regular else 1
+    if x.ndim != 6 or (x.shape[1], x.shape[4]) != (fields_in, channels) or x.shape[5] not in blocks:
+        raise ValueError(
+            f"expected maps (blocks, {fields_in}, H, W, {channels}, "
+            f"{' or '.join(map(str, blocks))}), got {tuple(x.shape)}"
+        )
+    sides = [side - 2 + 2 * padding for side in x.shape[2:4]]
+    if min(sides) < 1 or (pool and any(side % 2 for side in sides)):
+        wanted = "even and at least 2" if pool else "at least 1"
+        raise ValueError(
+            f"the convolution of {tuple(x.shape[2:4])} pixels with padding={padding} has "
+            f"{tuple(sides)}: expected {wanted} for pool={pool}"
+        )
+    if len(bias) != fields_out:
+        raise ValueError(f"expected {fields_out} biases, got {len(bias)}")
+    for name, tensor in (("maps", x), ("weights", weights), ("bias", bias)):
+        if tensor.dtype is not torch.float32 or tensor.device.type != "cpu":
+            raise ValueError(
+                f"expected {name} in float32 on the CPU, got {tensor.dtype} on {tensor.device}"
+            )
 
 
 def _forward(
@@ -198,7 +248,7 @@ def _forward(
     if pool:
         high, wide = high // 2, wide // 2
     y = x.new_empty(blocks, fields_out, high, wide, basis.order, block)
-    choice = torch.empty(y.shape, dtype=torch.uint8) if pool and keep_choice else None
+    choice = torch.empty_like(y, dtype=torch.uint8) if pool and keep_choice else None
     start = [ctypes.byref(layer), blocks]
     start += [tensor.data_ptr() for tensor in (x, weights, bias, y)]
     if block == 1:

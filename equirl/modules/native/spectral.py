@@ -14,8 +14,10 @@ finds by least squares, in float64, how spectral weights follow from steerable o
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,7 +28,7 @@ from equirl.symmetry import Element, SymmetryGroup
 
 from ..bases import kernel_basis
 
-__all__ = ["SpectralBasis", "spectral_basis"]
+__all__ = ["SpectralBasis", "plain_tensors", "spectral_basis"]
 
 # A term of a row: pixel function, spectral component of the input field, sign.
 _Term = tuple[str, int, int]
@@ -86,6 +88,16 @@ class SpectralBasis:
         return (weights @ self.transposition).transpose(0, 1).contiguous()
 
 
+@contextlib.contextmanager
+def plain_tensors() -> Iterator[None]:
+    """For constants that outlive the call: on the CPU, and fit for training.
+
+    Made in inference mode or under another default device, they would stay of that kind.
+    """
+    with torch.inference_mode(False), torch.device("cpu"):
+        yield
+
+
 @functools.cache
 def spectral_basis(group: SymmetryGroup, in_field: str) -> SpectralBasis | None:
     """The spectral form of 3 x 3 filters from a kind of field to regular fields.
@@ -125,7 +137,7 @@ def spectral_basis(group: SymmetryGroup, in_field: str) -> SpectralBasis | None:
         flipped = units.transpose(0, 2, 1, 3)[..., ::-1]
         solved = _solve(flat, flipped.reshape(len(units), -1))
         assert solved is not None
-        transposition = torch.tensor(solved, dtype=torch.float32)
+        transposition = _constant(solved)
     return SpectralBasis(
         order=order,
         cosets=cosets,
@@ -133,10 +145,15 @@ def spectral_basis(group: SymmetryGroup, in_field: str) -> SpectralBasis | None:
         size=len(units),
         edge=corners[0],
         axis=corners[1],
-        expansion=torch.tensor(expansion.reshape(len(basis), -1), dtype=torch.float32),
+        expansion=_constant(expansion.reshape(len(basis), -1)),
         transposition=transposition,
         channels=tuple(channels),
     )
+
+
+def _constant(values: np.ndarray) -> Tensor:
+    with plain_tensors():
+        return torch.tensor(values, dtype=torch.float32)
 
 
 def _coset_channels(group: SymmetryGroup, subgroup: SymmetryGroup) -> list[int]:
