@@ -82,11 +82,14 @@ def runs(layers: Iterable[SteerableConv], x: Tensor) -> bool:
         or forward_ad._current_level >= 0
     ):
         return False
-    parameters = [p for layer in layers for p in (layer.weights, layer.bias) if p is not None]
     return len(x) > 0 and all(
         t.dtype is torch.float32 and t.device.type == "cpu" and _has_memory(t)
-        for t in (x, *parameters)
+        for t in (x, *_parameters(layers))
     )
+
+
+def _parameters(layers: Iterable[SteerableConv]) -> list[Tensor]:
+    return [p for layer in layers for p in (layer.weights, layer.bias) if p is not None]
 
 
 def _has_memory(tensor: Tensor) -> bool:
@@ -107,8 +110,7 @@ def encode(layers: Sequence[SteerableConv], pools: Sequence[bool], x: Tensor) ->
     Returns:
         Shape (B, out channels, H', W'), channels in the order of the last layer's fields.
     """
-    parameters = [p for layer in layers for p in (layer.weights, layer.bias) if p is not None]
-    learning = torch.is_grad_enabled() and any(p.requires_grad for p in parameters)
+    learning = torch.is_grad_enabled() and any(p.requires_grad for p in _parameters(layers))
     batch, block = len(x), BLOCK if learning or len(x) >= SMALLEST_BATCH else 1
     x = to_blocks(x, block=block)
     for layer, pool in zip(layers, pools, strict=True):
