@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # before TorchRL is imported
+os.environ.setdefault("GOMP_SPINCOUNT", "1000")  # as in train.py
 
 import side_by_side
 import torch

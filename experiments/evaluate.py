@@ -7,6 +7,7 @@ python experiments/evaluate.py run=outputs/demo video=policy.mp4 first=100
 from __future__ import annotations
 
 import logging
+import os
 import sys
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from omegaconf import DictConfig
 
 from equirl.config import ConfigError, EvaluateJob, register, to_config
 
+os.environ.setdefault("GOMP_SPINCOUNT", "1000")  # as in train.py
 register()
 _log = logging.StreamHandler()  # for the package's own messages, to the standard error
 

@@ -21,6 +21,9 @@ from omegaconf import DictConfig, OmegaConf
 from equirl.config import Config, ConfigError, TrainJob, load_config, register, to_config
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL logs to the standard output
+# Threads that wait for one another soon sleep: where other work keeps a core busy, spinning
+# makes two threads ten times slower than one.
+os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 register()
 _log = logging.StreamHandler()  # for the package's own messages, to the standard error
 _failed: list[str] = []  # jobs of a multirun, each with its reason

@@ -85,7 +85,13 @@ def test_libraries_are_imported_in_one_place(library, place):
 
 
 @pytest.mark.parametrize(
-    ("room", "absent"), [("modules", "pybullet"), ("envs", "escnn"), ("training", "hydra")]
+    ("room", "absent"),
+    [
+        ("modules", "pybullet"),
+        ("envs", "escnn"),
+        ("training", "hydra"),
+        ("config", "torch"),  # whose environment the entry points still have to set
+    ],
 )
 def test_rooms_load_without_what_they_do_not_need(room, absent):
     code = f"import sys, equirl.{room}; assert {absent!r} not in sys.modules"
