@@ -11,7 +11,7 @@ from torch import Tensor
 
 from equirl.symmetry import Element, Irrep, Representation, SymmetryGroup
 
-__all__ = ["FieldType"]
+__all__ = ["FieldType", "element_key"]
 
 _REGULAR = "regular"
 _TRIVIAL, _SIGN, _VECTOR = Irrep.TRIVIAL.value, Irrep.SIGN.value, Irrep.VECTOR.value
@@ -145,10 +145,10 @@ class FieldType:
 
     def _source_elements(self, element: Element) -> list[int]:
         # A regular field is a function on the group; g moves its value at h to g h.
-        positions = {_key(h): index for index, h in enumerate(self.group.elements)}
-        if _key(element) not in positions:
+        positions = {element_key(h): index for index, h in enumerate(self.group.elements)}
+        if element_key(element) not in positions:
             raise ValueError(f"{element} is not an element of {self.group}")
-        return [positions[_key(element.inverse() @ h)] for h in self.group.elements]
+        return [positions[element_key(element.inverse() @ h)] for h in self.group.elements]
 
     def __str__(self) -> str:
         runs: list[list] = []
@@ -160,6 +160,6 @@ class FieldType:
         return f"{self.group.name}[{' + '.join(f'{count} {field}' for count, field in runs)}]"
 
 
-def _key(element: Element) -> tuple[int, bool]:
-    # Angles that differ by rounding or by full turns are the same element.
+def element_key(element: Element) -> tuple[int, bool]:
+    """The same for angles that differ by rounding or by full turns: the same element."""
     return round(element.angle / math.tau * 1e6) % 1_000_000, element.reflected

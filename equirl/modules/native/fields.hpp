@@ -109,23 +109,30 @@ struct Map {
     }
 };
 
-/// A map as it is. `each` calls use(pixel, channels) for the pixels of a tile of a field; they
-/// are zero outside of the map.
+/// Calls use(pixel, channels) for the pixels of a tile, with the channels that read(offset)
+/// gives inside of the map and zeros outside.
+template <int Channels, class Read, class Use>
+void each_pixel(const Map<Channels>& map, int field, const Tile& tile, const Read& read,
+                const Use& use) {
+    int pixel = 0;
+    for (int i = tile.row; i < tile.row + tile.rows; ++i)
+        for (int j = tile.column; j < tile.column + tile.columns; ++j, ++pixel) {
+            Vec values[Channels] = {};
+            if (map.inside(i, j))
+                for (int c = 0; c < Channels; ++c)
+                    values[c] = read(map.at(field, i, j) + c * kBlock);
+            use(pixel, values);
+        }
+}
+
+/// A map as it is.
 template <int Channels>
 struct Plain {
     Map<Channels> map;
     const float* x;
     template <class Use>
     void each(int field, const Tile& tile, const Use& use) const {
-        int pixel = 0;
-        for (int i = tile.row; i < tile.row + tile.rows; ++i)
-            for (int j = tile.column; j < tile.column + tile.columns; ++j, ++pixel) {
-                Vec values[Channels] = {};
-                if (map.inside(i, j))
-                    for (int c = 0; c < Channels; ++c)
-                        values[c] = load(x + map.at(field, i, j) + c * kBlock);
-                use(pixel, values);
-            }
+        each_pixel(map, field, tile, [&](size_t k) { return load(x + k); }, use);
     }
 };
 
@@ -136,18 +143,10 @@ struct Masked {
     const float *gradient, *output;
     template <class Use>
     void each(int field, const Tile& tile, const Use& use) const {
-        int pixel = 0;
-        for (int i = tile.row; i < tile.row + tile.rows; ++i)
-            for (int j = tile.column; j < tile.column + tile.columns; ++j, ++pixel) {
-                Vec values[Channels] = {};
-                if (map.inside(i, j)) {
-                    const size_t k = map.at(field, i, j);
-                    for (int c = 0; c < Channels; ++c)
-                        values[c] = keep(~mask(load(output + k + c * kBlock) <= 0),
-                                         load(gradient + k + c * kBlock));
-                }
-                use(pixel, values);
-            }
+        const auto read = [&](size_t k) {
+            return keep(~mask(load(output + k) <= 0), load(gradient + k));
+        };
+        each_pixel(map, field, tile, read, use);
     }
 };
 

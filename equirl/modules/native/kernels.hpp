@@ -87,6 +87,16 @@ size_t lay_out_output(float* memory, int pixels, int fields, Spectral* tile) {
     return lay_out(memory, pixels, G::singles, single, G::copies * fields, tile);
 }
 
+/// The spectral input and output of a tile in this thread's memory.
+template <bool Mirror, bool Regular>
+void lay_out_tiles(int pixels, int fields_in, int fields_out, Spectral* v, Spectral* o) {
+    const size_t in_size = lay_out_input<Mirror, Regular>(nullptr, pixels, fields_in, v);
+    const size_t out_size = lay_out_output<Mirror>(nullptr, pixels, fields_out, o);
+    float* memory = scratch<1>(in_size + out_size);
+    lay_out_input<Mirror, Regular>(memory, pixels, fields_in, v);
+    lay_out_output<Mirror>(memory + in_size, pixels, fields_out, o);
+}
+
 /// Input fields that are transformed at a time, so that they stay in cache.
 template <bool Mirror, bool Regular>
 int fields_at_once(int fields, int pixels, size_t bytes) {
@@ -213,11 +223,7 @@ void convolve(const Sizes& s, int blocks, const float* weights, int threads,
 #pragma omp parallel for schedule(static) num_threads(threads)
     for (int item = 0; item < items; ++item) {
         Spectral v, o;
-        const size_t in_size = lay_out_input<Mirror, Regular>(nullptr, n, chunk, &v);
-        const size_t out_size = lay_out_output<Mirror>(nullptr, n, s.fields_out, &o);
-        float* memory = scratch<1>(in_size + out_size);
-        lay_out_input<Mirror, Regular>(memory, n, chunk, &v);
-        lay_out_output<Mirror>(memory + in_size, n, s.fields_out, &o);
+        lay_out_tiles<Mirror, Regular>(n, chunk, s.fields_out, &v, &o);
         const int block = item / strips;
         const auto source = source_of(block / kSplits, block % kSplits);
         const Target target = target_of(block / kSplits, block % kSplits);
@@ -271,11 +277,7 @@ void correlate_maps(const Sizes& s, int blocks, float* weights, float* bias, int
 #pragma omp parallel for schedule(static, 1) num_threads(threads)
     for (int part = 0; part < parts; ++part) {
         Spectral v, o;
-        const size_t in_size = lay_out_input<Mirror, Regular>(nullptr, n, chunk, &v);
-        const size_t out_size = lay_out_output<Mirror>(nullptr, n, co, &o);
-        float* memory = scratch<1>(in_size + out_size);
-        lay_out_input<Mirror, Regular>(memory, n, chunk, &v);
-        lay_out_output<Mirror>(memory + in_size, n, co, &o);
+        lay_out_tiles<Mirror, Regular>(n, chunk, co, &v, &o);
         float* sum = sums + size * part;
         std::memset(sum, 0, size * sizeof(float));
         const int first = int(int64_t(items) * part / parts);

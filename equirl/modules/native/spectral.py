@@ -27,6 +27,7 @@ from torch import Tensor
 from equirl.symmetry import Element, SymmetryGroup
 
 from ..bases import kernel_basis
+from ..fields import element_key
 
 __all__ = ["SpectralBasis", "plain_tensors", "spectral_basis"]
 
@@ -158,13 +159,9 @@ def _constant(values: np.ndarray) -> Tensor:
 
 def _coset_channels(group: SymmetryGroup, subgroup: SymmetryGroup) -> list[int]:
     """Channels of a regular field, coset by coset of the subgroup."""
-    index = {_key(element): i for i, element in enumerate(group.elements)}
+    index = {element_key(element): i for i, element in enumerate(group.elements)}
     turns = [Element(math.tau * j / group.rotations) for j in range(group.rotations // 4)]
-    return [index[_key(h @ turn)] for turn in turns for h in subgroup.elements]
-
-
-def _key(element: Element) -> tuple[int, bool]:
-    return round(element.angle / math.tau * 1e6) % 1_000_000, element.reflected
+    return [index[element_key(h @ turn)] for turn in turns for h in subgroup.elements]
 
 
 def _corner_weights(filters: np.ndarray) -> tuple[float, float] | None:
