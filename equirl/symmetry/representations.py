@@ -117,7 +117,11 @@ class ScalarField:
         return self.rotate(flat, angles).reshape(image.shape)
 
     def rotate(self, image: Tensor, angles: Tensor) -> Tensor:
-        """Rotates ``image`` of shape (B, C, S, S) by ``angles`` of shape (B,), in rad."""
+        """Rotates ``image`` of shape (B, C, S, S) by ``angles`` of shape (B,), in rad.
+
+        Raises:
+            ValueError: The images are not square.
+        """
         size = image.shape[-1]
         if image.shape[-2] != size:
             raise ValueError(f"expected square images (B, C, S, S), got {tuple(image.shape)}")

@@ -368,6 +368,9 @@ def test_values_the_kernels_cannot_read_are_refused():
         native.conv_block(make_layer("D4", 2, 2, 1), x.double())
     with pytest.raises(ValueError, match="expected at least 1"):
         native.conv_block(make_layer("D4", 2, 2, 0), x[:, :, :2])
+    trivial = torch.zeros(1, 2, 8, 8, 1, 16, requires_grad=True)
+    with pytest.raises(ValueError, match="no gradient for trivial input"):
+        native.conv_block(make_layer("D4", 2, 2, 1, "trivial"), trivial)
     conv = make_layer("D4", 2, 2, 1)
     conv.bias = torch.nn.Parameter(torch.zeros(1))
     with pytest.raises(ValueError, match="expected 2 biases, got 1"):

@@ -203,7 +203,7 @@ void finish(const Target& target, const Sizes& s, const Tile& tile, const Spectr
             }
 }
 
-constexpr size_t kCache = 400 << 10;  // bytes of spectral input at a time
+constexpr size_t kCache = 400 << 10;  // bytes of spectral input at a time: within a 1 MB L2 cache
 
 /// Convolves every block. `source` and `target` give the maps of a block and split.
 template <bool Mirror, bool Regular, class MakeSource, class MakeTarget>
@@ -250,8 +250,8 @@ void convolve(const Sizes& s, int blocks, const float* weights, int threads,
 #if !defined(EQUIRL_ONE_IMAGE)
 inline int groups(int rows) { return (rows + 3) / 4; }
 
-/// Gradients of the weights and the bias. Work is divided into a fixed number of parts,
-/// summed in order: the result does not depend on the number of threads.
+/// Gradients of the weights and the bias. Work is divided into at most eight parts, whatever
+/// the number of threads, and summed in order: the result does not depend on that number.
 template <bool Mirror, bool Regular, class MakeSource, class MakeGradient>
 void correlate_maps(const Sizes& s, int blocks, float* weights, float* bias, int threads,
                     const MakeSource& source_of, const MakeGradient& gradient_of) {

@@ -179,7 +179,8 @@ def conv_block(conv: SteerableConv, x: Tensor, pool: bool = False, relu: bool = 
         subgroup in the kernels' order.
 
     Raises:
-        ValueError: The kernels do not serve the layer, or a shape or dtype is not as above.
+        ValueError: The kernels do not serve the layer, a shape or dtype is not as above, or
+            trivial input requires a gradient.
     """
     basis = _basis_of(conv)
     fields_out, fields_in = len(conv.out_type.fields), len(conv.in_type.fields)
@@ -213,12 +214,14 @@ def _check(
             f"expected maps (blocks, {fields_in}, H, W, {channels}, "
             f"{' or '.join(map(str, blocks))}), got {tuple(x.shape)}"
         )
-    sides = [side - 2 + 2 * padding for side in x.shape[2:4]]
+    if x.requires_grad and not basis.regular:
+        raise ValueError("the kernels have no gradient for trivial input, but it requires one")
+    sides = _convolved(x, padding)
     if min(sides) < 1 or (pool and any(side % 2 for side in sides)):
         wanted = "even and at least 2" if pool else "at least 1"
         raise ValueError(
             f"the convolution of {tuple(x.shape[2:4])} pixels with padding={padding} has "
-            f"{tuple(sides)}: expected {wanted} for pool={pool}"
+            f"{sides}: expected {wanted} for pool={pool}"
         )
     if len(bias) != fields_out:
         raise ValueError(f"expected {fields_out} biases, got {len(bias)}")
@@ -227,6 +230,11 @@ def _check(
             raise ValueError(
                 f"expected {name} in float32 on the CPU, got {tensor.dtype} on {tensor.device}"
             )
+
+
+def _convolved(x: Tensor, padding: int) -> tuple[int, int]:
+    """Height and width of the convolution of maps."""
+    return x.shape[2] - 2 + 2 * padding, x.shape[3] - 2 + 2 * padding
 
 
 def _forward(
@@ -246,7 +254,7 @@ def _forward(
         basis.order, basis.regular, fields_in, fields_out, height, width,
         padding, pool, relu, basis.edge, basis.axis,
     )  # fmt: skip
-    high, wide = (size - 2 + 2 * padding for size in (height, width))
+    high, wide = _convolved(x, padding)
     if pool:
         high, wide = high // 2, wide // 2
     y = x.new_empty(blocks, fields_out, high, wide, basis.order, block)
