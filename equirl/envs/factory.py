@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from equirl.envs.manipulation import ManipulationEnv
 from equirl.envs.tasks import make_task
@@ -17,13 +17,15 @@ def make_env(
     robot: Literal["panda", "hand"] = "panda",
     max_steps: int = 50,
     time_limit: Literal["truncate", "terminate"] = "truncate",
+    **options: Any,
 ) -> ManipulationEnv:
     """Returns an environment of the paper's simulation.
 
     ``functools.partial(make_env, ...)`` can be pickled and sent to worker processes.
 
     Args:
-        task: ``"block_picking"``.
+        task: ``"block_picking"``, ``"clutter_grasping"``, ``"block_pushing"`` or
+            ``"block_in_bowl"``.
         image_size: pixels along a side of the depth image, even.
         seed: seed of the first episode, as given to ``set_seed``.
         robot: ``"panda"``: the arm, as in the paper; ``"hand"``: its hand alone, free: faster,
@@ -31,6 +33,8 @@ def make_env(
         max_steps: length of an episode without success.
         time_limit: what the last of ``max_steps`` steps is: ``"truncate"`` (its value is
             bootstrapped) or ``"terminate"`` (as the paper's own implementation stores it).
+        options: numbers of the task, for example ``lift_height=0.12``; see the classes in
+            `equirl.envs.tasks`.
 
     Raises:
         ValueError: if an argument is not one of these.
@@ -51,7 +55,7 @@ def make_env(
         "'truncate' or 'terminate'",
     )
     return ManipulationEnv(
-        make_task(task),
+        make_task(task, **options),
         image_size=image_size,
         seed=seed,
         robot=robot,

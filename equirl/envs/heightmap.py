@@ -11,13 +11,14 @@ plane y = 0 the image with its columns flipped: bit for bit when the vertices ar
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy import ndarray as Array
 
 from equirl.envs.jit import compiled
-from equirl.envs.objects import Body
-from equirl.envs.scene import Scene
+from equirl.envs.objects import ObjectSet
+from equirl.envs.scene import Area, Scene
 from equirl.envs.workspace import Workspace
 
 # Closed coverage tests allow this much (m), so that no seam opens between two triangles.
@@ -47,65 +48,113 @@ class HeightmapSpec:
     finger_width: float = 0.020
 
 
-class Heightmap:
-    """Draws scenes of a fixed set of bodies.
+@dataclass(frozen=True, eq=False)
+class View:
+    """A scene reduced to what is drawn, free of trigonometry.
 
-    Args:
-        bodies: the bodies, in the order of `Scene.objects`.
-        spec: what the picture shows.
-        workspace: where the bin is.
+    Attributes:
+        vertices: of all bodies, relative to the end effector's x and y, shape (V, 3), m.
+        triangles: rows of three vertex indices, shape (T, 3).
+        position: end effector position, shape (3,), m.
+        finger_axis: unit vector along the finger axis in the plane, shape (2,).
+        aperture: distance between the fingers, m.
+        areas: one row (x, y, axis x, axis y) a marked square: its centre relative to the end
+            effector, m, and the direction of a side, shape (M, 4).
     """
 
-    def __init__(self, bodies: tuple[Body, ...], spec: HeightmapSpec, workspace: Workspace):
+    vertices: np.ndarray
+    triangles: np.ndarray
+    position: np.ndarray
+    finger_axis: np.ndarray
+    aperture: float
+    areas: np.ndarray
+
+
+class Heightmap:
+    """Draws scenes.
+
+    Args:
+        bodies: what scenes are made of, by name.
+        spec: what the picture shows.
+        workspace: where the bin is.
+        areas: the squares to mark, in the order of `Scene.areas`.
+    """
+
+    def __init__(
+        self,
+        bodies: ObjectSet,
+        spec: HeightmapSpec,
+        workspace: Workspace,
+        areas: tuple[Area, ...] = (),
+    ):
         self.spec = spec
-        shapes = [body.shape for body in bodies]
-        counts = [len(shape.vertices) for shape in shapes]
-        starts = np.cumsum([0, *counts])
-        self._vertices = np.concatenate([np.zeros((0, 3)), *(shape.vertices for shape in shapes)])
-        self._owner = np.repeat(np.arange(len(bodies)), counts)
-        self._triangles = np.concatenate(
-            [np.zeros((0, 3), np.int64)]
-            + [shape.triangles + k for shape, k in zip(shapes, starts[:-1], strict=True)]
-        ).astype(np.int64)
+        self._bodies = bodies
         bin_ = workspace.bin
         self._bin = np.array([bin_.floor_half_width, bin_.rim_half_width, bin_.rim_height])
+        self._areas = np.array([(area.side / 2, area.raise_by) for area in areas]).reshape(-1, 2)
+        # The geometry of the last scene; the next one's is mostly the same.
+        self._geometry = self._join((), ())
 
     def draw(self, scene: Scene) -> np.ndarray:
         """Returns the depth below the end effector, shape (S, S), float32, m."""
-        vertices = _place(self._vertices, self._owner, scene.objects, scene.position)
-        finger_axis = np.array([np.cos(scene.yaw), np.sin(scene.yaw)])
-        return self.draw_vertices(vertices, scene.position, finger_axis, scene.aperture)
+        return self.draw_view(self.view(scene))
 
-    def vertices(self, scene: Scene) -> np.ndarray:
-        """Returns the vertices of all bodies relative to the end effector's x and y, (V, 3), m."""
-        return _place(self._vertices, self._owner, scene.objects, scene.position)
+    def view(self, scene: Scene) -> View:
+        """Returns what there is to draw of ``scene``."""
+        scene = scene.named(self._bodies)
+        if self._geometry.key != (scene.names, scene.scales):
+            self._geometry = self._join(scene.names, scene.scales)
+        local, owner = self._geometry.vertices, self._geometry.owner
+        yaws = scene.areas[:, 2]
+        centres = scene.areas[:, :2] - scene.position[:2]
+        return View(
+            vertices=_place(local, owner, scene.objects, scene.position),
+            triangles=self._geometry.triangles,
+            position=scene.position,
+            finger_axis=np.array([np.cos(scene.yaw), np.sin(scene.yaw)]),
+            aperture=scene.aperture,
+            areas=np.column_stack((centres, np.cos(yaws), np.sin(yaws))),
+        )
 
-    def draw_vertices(
-        self, vertices: np.ndarray, position: np.ndarray, finger_axis: np.ndarray, aperture: float
-    ) -> np.ndarray:
-        """Draws placed vertices; `draw` without the trigonometry.
-
-        Args:
-            vertices: as `vertices` returns them, shape (V, 3), m.
-            position: end effector position, shape (3,), m.
-            finger_axis: unit vector along the finger axis in the plane, shape (2,).
-            aperture: distance between the fingers, m.
-
-        Returns:
-            The depth below the end effector, shape (S, S), float32, m.
-        """
-        spec = self.spec
+    def draw_view(self, view: View) -> np.ndarray:
+        """Returns the depth below the end effector, shape (S, S), float32, m."""
+        spec, position = self.spec, view.position
         depth = np.empty((spec.size, spec.size), np.float32)
         heights = np.empty((spec.size, spec.size))
         pitch = spec.side / spec.size
         ceiling = max(position[2] - spec.clearance, spec.min_ceiling)
         _draw_bin(heights, pitch, position[0], position[1], self._bin)
-        _draw_triangles(heights, pitch, vertices, self._triangles)
+        _draw_triangles(heights, pitch, view.vertices, view.triangles)
+        for (x, y, axis_x, axis_y), (half, raise_by) in zip(view.areas, self._areas, strict=True):
+            _raise_square(heights, pitch, x, y, axis_x, axis_y, half, raise_by)
         _finish(heights, depth, position[2], ceiling, spec.max_depth)
         half_length, half_width = spec.finger_length / 2, spec.finger_width / 2
-        centre = aperture / 2 + half_length
-        _draw_fingers(depth, pitch, finger_axis, centre, half_length, half_width)
+        centre = view.aperture / 2 + half_length
+        _draw_fingers(depth, pitch, view.finger_axis, centre, half_length, half_width)
         return depth
+
+    def _join(self, names: tuple[str, ...], scales: tuple[float, ...]) -> _Geometry:
+        """Joins the bodies of a scene into one list of triangles."""
+        vertices, owner, triangles, start = [np.zeros((0, 3))], [], [np.zeros((0, 3), int)], 0
+        for number, (name, scale) in enumerate(zip(names, scales, strict=True)):
+            for piece in self._bodies[name].scaled(scale).pieces:
+                vertices.append(piece.vertices)
+                triangles.append(piece.triangles + start)
+                owner += [number] * len(piece.vertices)
+                start += len(piece.vertices)
+        return _Geometry(
+            (names, scales),
+            np.concatenate(vertices),
+            np.array(owner, dtype=np.int64),
+            np.concatenate(triangles).astype(np.int64),
+        )
+
+
+class _Geometry(NamedTuple):
+    key: tuple[tuple[str, ...], tuple[float, ...]]
+    vertices: np.ndarray  # in the frames of their bodies
+    owner: np.ndarray  # the object each vertex belongs to
+    triangles: np.ndarray
 
 
 @compiled
@@ -186,6 +235,29 @@ def _draw_triangles(heights: Array, pitch: float, vertices: Array, triangles: Ar
                 height = a[2] + (slope_x * px + slope_y * py)
                 if height > heights[i, j]:
                     heights[i, j] = height
+
+
+@compiled
+def _raise_square(
+    heights: Array,
+    pitch: float,
+    centre_x: float,
+    centre_y: float,
+    axis_x: float,
+    axis_y: float,
+    half: float,
+    raise_by: float,
+) -> None:
+    """Adds ``raise_by`` to ``heights`` (S, S) in a square whose sides run along the axis."""
+    size = heights.shape[0]
+    for i in range(size):
+        x = (i + 0.5 - size / 2) * pitch - centre_x
+        for j in range(size):
+            y = (j + 0.5 - size / 2) * pitch - centre_y
+            along = abs(x * axis_x + y * axis_y)
+            across = abs(y * axis_x - x * axis_y)
+            if max(along, across) <= half:
+                heights[i, j] += raise_by
 
 
 @compiled

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -13,7 +14,7 @@ from torchrl.envs import EnvBase
 from equirl.envs.bullet import Camera, Simulation
 from equirl.envs.heightmap import Heightmap, HeightmapSpec
 from equirl.envs.scene import Scene
-from equirl.envs.tasks import Task
+from equirl.envs.tasks import PlacementError, State, Task
 from equirl.envs.workspace import Workspace
 
 # Actions may exceed 1 by this much, which is rounding; they are clipped.
@@ -30,11 +31,15 @@ class ManipulationEnv(EnvBase):
     float32, 1 on success, which terminates the episode, else 0. An object that leaves the
     workspace without being held terminates it too.
 
-    Episode i after ``set_seed(s)`` is a function of s, i and the actions, bit for bit, whatever
-    was simulated before. An environment connects to PyBullet at its first reset, so that it can
-    be built in one process and used in another.
+    Episode i after ``set_seed(s)`` is a function of s, i and the actions since, bit for bit,
+    whatever was simulated before. Some tasks play several episodes on one scene: the next reset
+    then goes on with what the last episode left (`scene_continues`). An environment connects to
+    PyBullet at its first reset, so that it can be built in one process and used in another.
 
     Use `equirl.envs.make_env`, which validates its arguments.
+
+    Attributes:
+        episodes_begun: how many there were since construction.
 
     Args:
         task: what is to be done.
@@ -66,11 +71,14 @@ class ManipulationEnv(EnvBase):
         self.max_steps = max_steps
         self.time_limit = time_limit
         self.robot = robot
-        self._heightmap = Heightmap(task.bodies, HeightmapSpec(image_size, task.view), workspace)
+        spec = HeightmapSpec(image_size, task.view)
+        self._heightmap = Heightmap(task.bodies, spec, workspace, task.areas)
         self._simulation: Simulation | None = None
         self._camera: Camera | None = None
         self._disconnected = False
+        self._state: State | None = None
         self._steps = 0
+        self.episodes_begun = 0
         self._make_specs(image_size)
         self._set_seed(seed)
 
@@ -87,30 +95,88 @@ class ManipulationEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         self._seed_sequence = np.random.SeedSequence(seed)
+        self._forget_scene()
+
+    def _forget_scene(self) -> None:
+        self._scene_seed: np.random.SeedSequence | None = None
+        self._scene_episodes = 0
+
+    @property
+    def scene_continues(self) -> bool:
+        """Whether the next reset goes on with the present scene instead of drawing a new one."""
+        return self._remaining() is not None
+
+    @property
+    def episode_seed(self) -> np.random.SeedSequence:
+        """A seed of the present episode's own, for policies that draw numbers (experts)."""
+        if self._scene_seed is None:
+            return np.random.SeedSequence(0)
+        key = (*self._scene_seed.spawn_key, self._scene_episodes)
+        return np.random.SeedSequence(self._scene_seed.entropy, spawn_key=key)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        # One generator an episode: nothing drawn in an episode changes the next ones.
-        (child,) = self._seed_sequence.spawn(1)
-        objects = self.task.sample(np.random.default_rng(child))
+        remaining = self._remaining()
+        scene = None
+        if remaining is not None:
+            scene = self._sent_home(self._connected().settled(remaining))
+        if scene is None or self._lost_object(scene, None):
+            # One generator a scene: nothing drawn in one changes the next ones.
+            (child,) = self._seed_sequence.spawn(1)
+            scene = self._new_scene(np.random.default_rng(child))
+            self._scene_seed, self._scene_episodes = child, 0
+        self._scene_episodes += 1
+        return self._begin(scene)
+
+    def _remaining(self) -> Scene | None:
+        """Returns what is left for the next episode of the present scene, if there is one."""
+        state = self._state
+        if state is None or self._scene_seed is None:
+            return None
+        if self._lost_object(state.scene, state.held):
+            return None
+        return self.task.continued(state, self.task.succeeded(state), self._scene_episodes)
+
+    def _new_scene(self, rng: np.random.Generator) -> Scene:
+        task, home = self.task, self._sent_home(None)
+        for _ in range(task.placement_tries):
+            scene = task.sample(rng, home).named(task.bodies)
+            if not task.drops_objects:
+                return scene
+            scene = self._connected().dropped(scene)
+            if not self._lost_object(scene, None):
+                return scene
+        raise PlacementError(
+            f"no scene in {task.placement_tries} tries: each time an object came to rest more than "
+            f"{task.margin} m outside the workspace of ±{self.workspace.half_width} m"
+        )
+
+    def _sent_home(self, scene: Scene | None) -> Scene:
+        """Returns ``scene`` with the robot where episodes start; without objects if None."""
         space = self.workspace
-        home = np.array([0.0, 0.0, space.home_height])
-        return self.set_scene(Scene(home, 0.0, space.max_aperture, objects))
+        home = Scene([0.0, 0.0, space.home_height], 0.0, space.max_aperture, np.zeros((0, 7)))
+        if scene is None:
+            return home
+        robot = {name: getattr(home, name) for name in ("position", "yaw", "aperture", "grip")}
+        return replace(scene, **robot)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        simulation = self._connected()
-        before = simulation.scene()
-        position, yaw, aperture = self._target(before, tensordict.get("action"))
-        simulation.act(position, yaw, aperture)
+        position, yaw, aperture = self._target(self.get_scene(), tensordict.get("action"))
+        self._connected().act(position, yaw, aperture)
         self._steps += 1
-        scene, held = simulation.scene(), simulation.held()
-        success = self.task.succeeded(scene, held)
+        state = self._measure()
+        success = self.task.succeeded(state)
         out_of_time = self._steps >= self.max_steps
-        terminated = success or self._lost_object(scene, held)
+        terminated = success or self._lost_object(state.scene, state.held)
         if self.time_limit == "terminate":
             terminated = terminated or out_of_time
-        step = self._observe(scene, held, terminated, out_of_time and not terminated)
+        step = self._observe(state, terminated, out_of_time and not terminated)
         step.set("reward", torch.tensor([float(success)]))
         return step
+
+    def _measure(self) -> State:
+        simulation = self._connected()
+        self._state = State(simulation.scene(), simulation.held(), simulation.touching)
+        return self._state
 
     def _target(self, scene: Scene, action: torch.Tensor) -> tuple[np.ndarray, float, float]:
         """Returns the target position (m), yaw (rad) and aperture (m) of ``action`` (5,)."""
@@ -133,12 +199,12 @@ class ManipulationEnv(EnvBase):
         )
 
     def _observe(
-        self, scene: Scene, held: int | None, terminated: bool = False, truncated: bool = False
+        self, state: State, terminated: bool = False, truncated: bool = False
     ) -> TensorDict:
-        depth = torch.from_numpy(self._heightmap.draw(scene))[None]
+        depth = torch.from_numpy(self._heightmap.draw(state.scene))[None]
         values = {
             "depth": depth,
-            "holding": torch.tensor([float(held is not None)]),
+            "holding": torch.tensor([float(state.held is not None)]),
             "done": torch.tensor([terminated or truncated]),
             "terminated": torch.tensor([terminated]),
             "truncated": torch.tensor([truncated]),
@@ -153,35 +219,52 @@ class ManipulationEnv(EnvBase):
             self.is_closed = False  # so that EnvBase disconnects when this is collected
         return self._simulation
 
+    def _begin(self, scene: Scene) -> TensorDictBase:
+        self._connected().place(scene)
+        self._steps = 0
+        self.episodes_begun += 1
+        return self._observe(self._measure())
+
     def get_scene(self) -> Scene:
-        """Returns the measured state as a plain value (velocities are not part of it)."""
-        return self._connected().scene()
+        """Returns the measured state as a plain value (velocities are not part of it).
+
+        Raises:
+            RuntimeError: before the first reset.
+        """
+        return self._present().scene
+
+    def held_object(self) -> int | None:
+        """Returns the index in `Scene.objects` of the object in the gripper, or None."""
+        return self._present().held
+
+    def _present(self) -> State:
+        if self._state is None:
+            raise RuntimeError("the environment has no scene yet; reset it first")
+        return self._state
 
     def set_scene(self, scene: Scene) -> TensorDictBase:
-        """Starts an episode, at rest, from ``scene``.
+        """Starts an episode, at rest, from ``scene``; the next reset draws a new one.
 
         Args:
-            scene: poses of the gripper and of the task's objects.
+            scene: poses of the gripper and of objects of the task, and the task's areas.
 
         Returns:
             What `reset` returns, ready for an action and `step`.
 
         Raises:
-            ValueError: if the scene has another number of objects than the task or the gripper is
-                outside the workspace.
+            ValueError: if the scene has objects or areas that the task does not have, or the
+                gripper is outside the workspace.
         """
         if not self.workspace.contains(scene.position, margin=5e-3):
             raise ValueError(
                 f"the end effector at {scene.position.tolist()} (m) is outside {self.workspace}"
             )
-        simulation = self._connected()
-        simulation.place(scene)
-        self._steps = 0
-        return self._observe(simulation.scene(), simulation.held())
-
-    def held_object(self) -> int | None:
-        """Returns the index in `Scene.objects` of the object in the gripper, or None."""
-        return self._connected().held()
+        wanted = len(self.task.areas)
+        if len(scene.areas) != wanted:
+            raise ValueError(f"the scene has {len(scene.areas)} areas, the task has {wanted}")
+        scene = scene.named(self.task.bodies)
+        self._forget_scene()
+        return self._begin(scene)
 
     def render(self, width: int = 640, height: int = 480) -> np.ndarray:
         """Returns a colour picture of the cell, shape (height, width, 3), uint8.
@@ -191,9 +274,9 @@ class ManipulationEnv(EnvBase):
         """
         simulation = self._connected()
         if self._camera is None:
-            self._camera = Camera(self.task.bodies, self.robot, self.workspace)
-        objects = simulation.scene().objects
-        return self._camera.picture(simulation.joint_values(), objects, width, height)
+            task = self.task
+            self._camera = Camera(task.bodies, task.areas, self.robot, self.workspace)
+        return self._camera.picture(simulation.joint_values(), self.get_scene(), width, height)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Disconnects from PyBullet; harmless when done before."""

@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Collection, Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 
+@dataclass(frozen=True)
+class Area:
+    """A square marked in the depth image, by adding to the height of what lies in it.
+
+    Attributes:
+        side: m.
+        raise_by: height added, m.
+    """
+
+    side: float
+    raise_by: float
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Poses of the gripper and of the objects; everything is at rest.
+    """Poses of the gripper and of the objects, and marked areas; everything is at rest.
 
     Lengths in metres, angles in radians, in the frame of `equirl.envs.workspace.Workspace` (origin
     at the centre of the floor of the bin, z up).
@@ -21,9 +34,12 @@ class Scene:
         position: end effector position, shape (3,).
         yaw: angle from world x to the finger axis, about world z; unbounded.
         aperture: distance between the fingers.
-        objects: one row (x, y, z, qx, qy, qz, qw) an object, shape (N, 7), in the task's order.
+        objects: one row (x, y, z, qx, qy, qz, qw) an object, shape (N, 7).
         grip: aperture the gripper is driven to; smaller than `aperture` when it squeezes an object.
             Defaults to `aperture`.
+        names: what each object is, N names of the task's bodies. Empty: its first N, in order.
+        scales: size of each object relative to the task's body, N numbers. Empty: all 1.
+        areas: one row (x, y, yaw) for the centre of each area the task marks, shape (M, 3).
     """
 
     position: np.ndarray
@@ -31,40 +47,71 @@ class Scene:
     aperture: float
     objects: np.ndarray
     grip: float = None  # type: ignore[assignment]  # replaced by the aperture
+    names: tuple[str, ...] = ()
+    scales: tuple[float, ...] = ()
+    areas: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
 
     def __post_init__(self) -> None:
         position = _frozen(self.position)
         if position.shape != (3,) or not np.isfinite(position).all():
             raise ValueError(f"position must be three finite numbers (m), got {self.position!r}")
-        objects = _frozen(self.objects)
-        if objects.size == 0:
-            objects = _frozen(np.zeros((0, 7)))
-        if objects.ndim != 2 or objects.shape[1] != 7 or not np.isfinite(objects).all():
-            raise ValueError(
-                "objects must be finite rows (x, y, z, qx, qy, qz, qw), "
-                f"got an array of shape {objects.shape}: {self.objects!r}"
-            )
+        objects = _rows("objects", self.objects, 7, "(x, y, z, qx, qy, qz, qw)")
+        areas = _rows("areas", self.areas, 3, "(x, y, yaw)")
         norms = np.linalg.norm(objects[:, 3:], axis=1)
         if np.any(np.abs(norms - 1) > 1e-3):
             raise ValueError(f"object quaternions must have norm 1, got norms {norms}")
-        for name in ("yaw", "aperture"):
-            if not np.isfinite(getattr(self, name)):
-                raise ValueError(f"{name} must be finite, got {getattr(self, name)!r}")
         grip = self.aperture if self.grip is None else self.grip
+        for name, value in (("yaw", self.yaw), ("aperture", self.aperture), ("grip", grip)):
+            if not np.isfinite(value):
+                raise ValueError(f"{name} must be finite, got {value!r}")
+            object.__setattr__(self, name, float(value))
+        scales = tuple(map(float, self.scales)) or (1.0,) * len(objects)
+        for name, values in (("names", self.names or scales), ("scales", scales)):
+            if len(values) != len(objects):
+                raise ValueError(f"{len(objects)} objects but {len(values)} {name}: {values}")
+        if not all(0 < scale < np.inf for scale in scales):
+            raise ValueError(f"scales must be positive, got {scales}")
         object.__setattr__(self, "position", position)
         object.__setattr__(self, "objects", objects)
-        object.__setattr__(self, "yaw", float(self.yaw))
-        object.__setattr__(self, "aperture", float(self.aperture))
-        object.__setattr__(self, "grip", float(grip))
+        object.__setattr__(self, "areas", areas)
+        object.__setattr__(self, "names", tuple(self.names))
+        object.__setattr__(self, "scales", scales)
 
     def __eq__(self, other: object) -> bool:
         """Bit-equality of all values."""
         if not isinstance(other, Scene):
             return NotImplemented
-        return (
-            np.array_equal(self.position, other.position)
-            and np.array_equal(self.objects, other.objects)
-            and (self.yaw, self.aperture, self.grip) == (other.yaw, other.aperture, other.grip)
+        return all(
+            np.array_equal(getattr(self, each.name), getattr(other, each.name))
+            for each in fields(self)
+        )
+
+    def named(self, known: Collection[str]) -> Scene:
+        """Returns the scene with the name of each object.
+
+        Args:
+            known: the names there are; an object without one takes its place in this order.
+
+        Raises:
+            ValueError: if a name is unknown, or unnamed objects are more than names.
+        """
+        for name in self.names:
+            if name not in known:
+                raise ValueError(f"the scene has an unknown object {name!r}; known: {known!r}")
+        if self.names:
+            return self
+        if len(self.objects) > len(known):
+            raise ValueError(f"the scene has {len(self.objects)} objects, the task {len(known)}")
+        return replace(self, names=tuple(known)[: len(self.objects)])
+
+    def without(self, index: int) -> Scene:
+        """Returns the scene without one of its objects."""
+        kept = [k for k in range(len(self.objects)) if k != index]
+        return replace(
+            self,
+            objects=self.objects[kept],
+            names=tuple(self.names[k] for k in kept) if self.names else (),
+            scales=tuple(self.scales[k] for k in kept),
         )
 
     def turned(self, angle: float) -> Scene:
@@ -73,31 +120,34 @@ class Scene:
         Multiples of a quarter turn move the positions exactly (no cosine is taken).
         """
         turn = Rotation.from_euler("z", angle)
+        objects, areas = self.objects.copy(), self.areas.copy()
+        objects[:, :3] = _turn_points(self.objects[:, :3], angle)
+        objects[:, 3:] = _compose(turn, self.objects[:, 3:])
+        areas[:, :2] = _turn_points(self.areas[:, :2], angle)
+        areas[:, 2] += angle
         return replace(
             self,
             position=_turn_points(self.position[None], angle)[0],
             yaw=self.yaw + angle,
-            objects=np.concatenate(
-                (
-                    _turn_points(self.objects[:, :3], angle),
-                    _compose(turn, self.objects[:, 3:]),
-                ),
-                axis=1,
-            ),
+            objects=objects,
+            areas=areas,
         )
 
     def reflected(self) -> Scene:
         """Returns the scene mirrored in the plane y = 0.
 
         An object's mirror image is again a pose of that object only if its own shape has the
-        mirror plane y = 0 (a box, a body of revolution about its x or z axis).
+        mirror plane y = 0 (`Body.has_mirror_symmetry`).
         """
         mirror = np.array([1.0, -1.0, 1.0])
-        objects = self.objects.copy()
-        objects[:, :3] *= mirror
         # M R M for M = diag(1, -1, 1): the axis is a pseudo-vector.
-        objects[:, 3:] *= np.array([-1.0, 1.0, -1.0, 1.0])
-        return replace(self, position=self.position * mirror, yaw=-self.yaw, objects=objects)
+        return replace(
+            self,
+            position=self.position * mirror,
+            yaw=-self.yaw,
+            objects=self.objects * (*mirror, -1.0, 1.0, -1.0, 1.0),
+            areas=self.areas * (1.0, -1.0, -1.0),
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Returns the scene as a dictionary of lists and floats, ready for JSON."""
@@ -118,15 +168,27 @@ def _frozen(values: Any) -> np.ndarray:
     return array
 
 
+def _rows(name: str, values: Any, width: int, meaning: str) -> np.ndarray:
+    rows = _frozen(values)
+    if rows.size == 0:
+        rows = _frozen(np.zeros((0, width)))
+    if rows.ndim != 2 or rows.shape[1] != width or not np.isfinite(rows).all():
+        raise ValueError(
+            f"{name} must be finite rows {meaning}, got an array of shape {rows.shape}: {values!r}"
+        )
+    return rows
+
+
 def _turn_points(points: np.ndarray, angle: float) -> np.ndarray:
+    """Turns rows (x, y, ...) about the origin; further columns stay."""
     quarters = round(angle / (np.pi / 2))
-    x, y, z = points.T
+    x, y, *rest = points.T
     if abs(angle - quarters * np.pi / 2) < 1e-12:
         x, y = ((x, y), (-y, x), (-x, -y), (y, -x))[quarters % 4]
     else:
         cos, sin = np.cos(angle), np.sin(angle)
         x, y = cos * x - sin * y, sin * x + cos * y
-    return np.stack((x, y, z), axis=1)
+    return np.stack((x, y, *rest), axis=1)
 
 
 def _compose(turn: Rotation, quaternions: np.ndarray) -> np.ndarray:

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from equirl.envs import Scene, jit
 from equirl.envs.heightmap import Heightmap, HeightmapSpec
-from equirl.envs.objects import Body, ConvexPolyhedron, cube
+from equirl.envs.objects import Body, ConvexPolyhedron, ObjectSet, bowl, cube
+from equirl.envs.scene import Area
 from equirl.envs.workspace import Workspace
 
 QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 REFLECTION = np.diag([1.0, -1.0, 1.0])
+AREAS = (Area(0.09, 0.02),)
 
 
-def heightmap(size: int = 64, side: float = 0.30, bodies=None) -> Heightmap:
+def heightmap(size: int = 64, side: float = 0.30, bodies=None, areas=()) -> Heightmap:
     bodies = (cube(0.05, 0.1, 1.0),) if bodies is None else bodies
-    return Heightmap(bodies, HeightmapSpec(size, side), Workspace())
+    return Heightmap(ObjectSet(bodies, "test"), HeightmapSpec(size, side), Workspace(), areas)
 
 
 def random_scene(rng: np.random.Generator, objects: int = 1) -> Scene:
@@ -29,25 +33,32 @@ def random_scene(rng: np.random.Generator, objects: int = 1) -> Scene:
         axis=1,
     )
     position = rng.uniform((-0.15, -0.15, 0.01), (0.15, 0.15, 0.25))
-    return Scene(position, rng.uniform(-4, 4), rng.uniform(0, 0.08), poses)
+    area = [[*rng.uniform(-0.1, 0.1, 2), rng.uniform(-4, 4)]]
+    return Scene(position, rng.uniform(-4, 4), rng.uniform(0, 0.08), poses, areas=area)
 
 
 def draw_moved(picture: Heightmap, scene: Scene, matrix: np.ndarray) -> np.ndarray:
     """Draws the scene moved by an exact signed permutation, without any trigonometry."""
-    axis = np.array([np.cos(scene.yaw), np.sin(scene.yaw)])
-    vertices = picture.vertices(scene) @ matrix.T
-    return picture.draw_vertices(
-        vertices, matrix @ scene.position, matrix[:2, :2] @ axis, scene.aperture
+    view, plane = picture.view(scene), matrix[:2, :2]
+    areas = np.hstack((view.areas[:, :2] @ plane.T, view.areas[:, 2:] @ plane.T))
+    moved = replace(
+        view,
+        vertices=view.vertices @ matrix.T,
+        position=matrix @ view.position,
+        finger_axis=plane @ view.finger_axis,
+        areas=areas,
     )
+    return picture.draw_view(moved)
 
 
 @pytest.mark.parametrize("size", [10, 64, 126, 128])
 def test_turns_and_reflections_of_the_scene_move_the_image_bit_for_bit(size):
     rng = np.random.default_rng(size)
-    hull = Body(ConvexPolyhedron.hull(rng.normal(scale=0.03, size=(20, 3))), 0.1, 1.0)
-    picture = heightmap(size, bodies=(cube(0.05, 0.1, 1.0), hull))
+    hull = Body((ConvexPolyhedron.hull(rng.normal(scale=0.03, size=(20, 3))),), 0.1, 1.0)
+    bodies = (cube(0.05, 0.1, 1.0), hull, bowl(0.16, 0.07, 0.1, 1.0))
+    picture = heightmap(size, bodies=bodies, areas=AREAS)
     for _ in range(40):
-        scene = random_scene(rng, objects=2)
+        scene = random_scene(rng, objects=3)
         image = picture.draw(scene)
         np.testing.assert_array_equal(draw_moved(picture, scene, np.eye(3)), image)
         turned = draw_moved(picture, scene, QUARTER_TURN)
@@ -68,7 +79,7 @@ def test_an_axis_aligned_cube_whose_edges_run_through_pixel_centres_is_drawn_sym
 
 
 def test_turned_scenes_agree_to_a_micrometre_but_for_silhouettes():
-    picture, rng = heightmap(64), np.random.default_rng(0)
+    picture, rng = heightmap(64, areas=AREAS), np.random.default_rng(0)
     for _ in range(20):
         scene = random_scene(rng)
         turned = picture.draw(scene.turned(np.pi / 2))
@@ -112,6 +123,31 @@ def test_the_fingers_are_two_rectangles_at_depth_zero_along_the_yaw():
     quarter = picture.draw(Scene([0, 0, 0.2], np.pi / 2, 0.06, [[0.1, 0.1, 0.025, 0, 0, 0, 1]]))
     rows, columns = np.nonzero(quarter == 0)
     assert np.abs(rows - 149.5).max() == 9.5  # the fingers separate along y now
+
+
+@pytest.mark.parametrize(("size", "side"), [(128, 0.45), (142, 0.45), (64, 0.30)])
+def test_a_marked_area_raises_what_lies_in_it_and_keeps_its_metric_size(size, side):
+    picture = heightmap(size, side, areas=AREAS)
+    cube_pose = [0.06, 0.04, 0.025, 0, 0, 0, 1]
+    scene = Scene([0, 0, 0.2], 0.0, 0.0, [cube_pose], areas=[[0.06, 0.05, 0.0]])
+    raised = picture.draw(scene)
+    plain = heightmap(size, side).draw(replace(scene, areas=[]))
+    difference = plain - raised
+    marked = difference > 1e-6
+    np.testing.assert_allclose(difference[marked], 0.02, atol=1e-6)  # floor and cube alike
+    assert marked.sum() * (side / size) ** 2 == pytest.approx(0.09**2, rel=0.06)
+    rows, columns = np.nonzero(marked)
+    centre = (np.array([rows.mean(), columns.mean()]) + 0.5 - size / 2) * side / size
+    np.testing.assert_allclose(centre, (0.06, 0.05), atol=side / size)
+
+
+def test_an_area_turns_with_its_yaw():
+    picture = heightmap(128, 0.45, areas=AREAS)
+    scene = Scene([0, 0, 0.2], 0.0, 0.0, [], areas=[[0.1, 0.0, np.pi / 4]])
+    difference = heightmap(128, 0.45).draw(replace(scene, areas=[])) - picture.draw(scene)
+    rows, columns = np.nonzero(difference > 1e-6)
+    for side in (rows, columns):
+        assert (np.ptp(side) + 1) * 0.45 / 128 == pytest.approx(0.09 * 2**0.5, abs=0.01)
 
 
 def test_surfaces_above_the_fingers_are_clamped_and_depth_is_clipped():

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from equirl.envs import Scene
 from equirl.envs.bullet import Simulation
 from equirl.envs.bullet.kinematics import panda_joints
-from equirl.envs.objects import cube
+from equirl.envs.objects import ObjectSet, cube
 from equirl.envs.workspace import Workspace
 
 ROBOTS = ("panda", "hand")
@@ -19,7 +19,7 @@ ASIDE = [0.12, 0.12, 0.025, 0, 0, 0, 1]
 
 @pytest.fixture(params=ROBOTS)
 def simulation(request):
-    simulation = Simulation((cube(0.05, 0.1, 1.0),), request.param, SPACE)
+    simulation = Simulation(ObjectSet([cube(0.05, 0.1, 1.0)], "test"), request.param, SPACE)
     yield simulation
     simulation.close()
 
@@ -134,5 +134,5 @@ def test_a_pushed_cube_slides_back_off_the_walls(simulation):
 
 
 def test_a_scene_with_another_number_of_objects_is_refused(simulation):
-    with pytest.raises(ValueError, match="the scene has 2 objects, the task has 1"):
+    with pytest.raises(ValueError, match="the scene has 2 objects, the task 1"):
         simulation.place(Scene([0, 0, 0.2], 0.0, 0.08, [ASIDE, ASIDE]))

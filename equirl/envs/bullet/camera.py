@@ -5,12 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from equirl.envs.bullet.client import Client
+from equirl.envs.bullet.loading import load_picture
 from equirl.envs.bullet.models import load_robot, robot_model
-from equirl.envs.objects import Body
+from equirl.envs.objects import ObjectSet
+from equirl.envs.scene import Area, Scene
 from equirl.envs.workspace import Workspace
 
 _TABLE_COLOR = (0.93, 0.93, 0.91, 1.0)
 _WALL_COLOR = (0.55, 0.65, 0.75, 1.0)
+_AREA_COLOR = (0.35, 0.75, 0.45, 1.0)
 
 
 class Camera:
@@ -20,28 +23,31 @@ class Camera:
 
     Args:
         bodies: as for `Simulation`.
+        areas: the squares that the task marks, in the order of `Scene.areas`.
         robot: as for `Simulation`.
         workspace: as for `Simulation`.
     """
 
-    def __init__(self, bodies: tuple[Body, ...], robot: str, workspace: Workspace):
+    def __init__(
+        self, bodies: ObjectSet, areas: tuple[Area, ...], robot: str, workspace: Workspace
+    ):
+        self._bodies = bodies
         self._client = client = Client()
         self._robot = load_robot(client, robot_model(robot, workspace), visual=True)
         self._add_bin(workspace)
-        self._bodies = [self._add_body(body) for body in bodies]
+        self._areas = [self._add_area(area) for area in areas]
+        self._shown: dict[tuple[int, str, float], int] = {}
 
     def close(self) -> None:
         """Disconnects; harmless when done before."""
         self._client.close()
 
-    def picture(
-        self, joints: np.ndarray, objects: np.ndarray, width: int, height: int
-    ) -> np.ndarray:
+    def picture(self, joints: np.ndarray, scene: Scene, width: int, height: int) -> np.ndarray:
         """Returns the picture of a state.
 
         Args:
             joints: values of all joints of the robot, shape (J,).
-            objects: poses (x, y, z, qx, qy, qz, qw), shape (N, 7).
+            scene: as `Simulation.scene` returns it.
             width: pixels.
             height: pixels.
 
@@ -51,7 +57,10 @@ class Camera:
         client = self._client
         for index, value in enumerate(joints):
             client.resetJointState(self._robot, index, value)
-        for body, pose in zip(self._bodies, objects, strict=True):
+        for body, (x, y, yaw) in zip(self._areas, scene.areas.tolist(), strict=True):
+            turn = (0, 0, np.sin(yaw / 2), np.cos(yaw / 2))
+            client.resetBasePositionAndOrientation(body, (x, y, 5e-4), turn)
+        for body, pose in zip(self._show(scene), scene.objects, strict=True):
             client.resetBasePositionAndOrientation(body, pose[:3].tolist(), pose[3:].tolist())
         view = client.computeViewMatrix((0.85, -0.85, 0.75), (-0.14, 0.0, 0.22), (0, 0, 1))
         projection = client.computeProjectionMatrixFOV(45, width / height, 0.05, 5.0)
@@ -84,28 +93,20 @@ class Camera:
             turn = (0, 0, np.sin(quarter * np.pi / 4), np.cos(quarter * np.pi / 4))
             client.createMultiBody(0, baseVisualShapeIndex=wall, baseOrientation=turn)
 
-    def _add_body(self, body: Body) -> int:
-        client = self._client
-        vertices, triangles = body.shape.vertices, body.shape.triangles
-        # Own corners for each triangle, in outward order, so that faces are shaded flat.
-        outward = _outward(vertices, triangles)
-        corners = vertices[outward].reshape(-1, 3)
-        normals = np.cross(corners[1::3] - corners[0::3], corners[2::3] - corners[0::3])
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        shape = client.createVisualShape(
-            client.GEOM_MESH,
-            vertices=corners.tolist(),
-            indices=list(range(len(corners))),
-            normals=np.repeat(normals, 3, axis=0).tolist(),
-            rgbaColor=body.color,
+    def _add_area(self, area: Area) -> int:
+        half = area.side / 2
+        shape = self._client.createVisualShape(
+            self._client.GEOM_BOX, halfExtents=(half, half, 4e-4), rgbaColor=_AREA_COLOR
         )
-        return client.createMultiBody(0, baseVisualShapeIndex=shape)
+        return self._client.createMultiBody(0, baseVisualShapeIndex=shape)
 
-
-def _outward(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Orders triangles (T, 3) counter-clockwise as seen from outside."""
-    a, b, c = (vertices[triangles[:, k]] for k in range(3))
-    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), a - vertices.mean(0)) < 0
-    ordered = triangles.copy()
-    ordered[inward] = ordered[inward][:, ::-1]
-    return ordered
+    def _show(self, scene: Scene) -> list[int]:
+        """Makes the pictures of a scene's objects, unless they are there; returns their ids."""
+        keys = list(zip(range(len(scene.objects)), scene.names, scene.scales, strict=True))
+        for key in self._shown.keys() - set(keys):
+            self._client.removeBody(self._shown.pop(key))
+        for key in keys:
+            if key not in self._shown:
+                _, name, scale = key
+                self._shown[key] = load_picture(self._client, self._bodies[name].scaled(scale))
+        return [self._shown[key] for key in keys]

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from equirl.envs.bullet.client import Client
+from equirl.envs.bullet.loading import load_body, load_collision_shape, load_placeholder
 from equirl.envs.bullet.models import robot_model
 from equirl.envs.bullet.robot import Robot
-from equirl.envs.objects import Body
+from equirl.envs.objects import ObjectSet
 from equirl.envs.scene import Scene
 from equirl.envs.workspace import Workspace
 
@@ -16,6 +19,12 @@ SOLVER_ITERATIONS = 20
 # Contact normals with a smaller vertical part count as lateral, distances below this as touching.
 _LATERAL_NORMAL = 0.2
 _TOUCHING = 5e-4
+# Objects are at rest when they move slower than this (m/s, rad/s) for so many steps.
+_REST_SPEED, _REST_SPIN, _REST_STEPS = 0.005, 0.1, 4
+_PATIENCE = 240  # steps after which objects count as settled although they move
+_OUT_OF_THE_WAY = (0.0, 0.0, 0.45)  # of falling objects: where the robot waits, m
+# PyBullet leaks a few kB for every body made and does not free shapes: connect anew after these.
+_MAX_LOADS = 250
 
 
 class Simulation:
@@ -25,12 +34,18 @@ class Simulation:
     what went before it.
 
     Args:
-        bodies: what to load, in the order of `Scene.objects`.
+        bodies: what scenes are made of, by name.
         robot: ``"panda"`` or ``"hand"``.
         workspace: dimensions of the cell.
     """
 
-    def __init__(self, bodies: tuple[Body, ...], robot: str, workspace: Workspace):
+    def __init__(self, bodies: ObjectSet, robot: str, workspace: Workspace):
+        self._bodies = bodies
+        self._model = robot_model(robot, workspace)
+        self._workspace = workspace
+        self._connect()
+
+    def _connect(self) -> None:
         self._client = client = Client()
         client.setGravity(0, 0, -9.81)
         client.setPhysicsEngineParameter(
@@ -39,11 +54,16 @@ class Simulation:
             deterministicOverlappingPairs=1,
             # Always all iterations: stopping at a residual was seen to depend on earlier episodes.
             solverResidualThreshold=0,
+            enableFileCaching=0,  # or a shape would be that of an earlier file of the same name
         )
-        self._load_bin(workspace)
-        model = robot_model(robot, workspace)
-        self._robot = Robot(client, model, TIME_STEP, workspace.max_aperture)
-        self._bodies = [self._load_body(body) for body in bodies]
+        self._load_bin()
+        self._robot = Robot(client, self._model, TIME_STEP, self._workspace.max_aperture)
+        self._placeholder = load_placeholder(client)
+        self._shapes: dict[tuple[str, float], int] = {}
+        self._present: tuple[tuple[str, float], ...] = ()  # name and scale of each object
+        self._ids: list[int] = []
+        self._loads = 0
+        self._areas = np.zeros((0, 3))
 
     def close(self) -> None:
         """Disconnects; harmless when done before."""
@@ -52,31 +72,67 @@ class Simulation:
     def place(self, scene: Scene) -> None:
         """Puts everything at rest into ``scene``, forgetting all contacts of the past.
 
+        Args:
+            scene: a state of bodies of this simulation.
+
         Raises:
-            ValueError: if the scene has another number of objects than was loaded.
+            ValueError: if it has others.
         """
-        if len(scene.objects) != len(self._bodies):
-            raise ValueError(
-                f"the scene has {len(scene.objects)} objects, the task has {len(self._bodies)}"
-            )
+        scene = scene.named(self._bodies)
+        self._load(tuple(zip(scene.names, scene.scales, strict=True)))
         # Cached contact points would otherwise warm-start the solver: part all bodies first.
         client = self._client
-        for k, body in enumerate(self._bodies):
+        for k, body in enumerate(self._ids):
             client.resetBasePositionAndOrientation(body, (5.0, 2.0 * k, 5.0), (0, 0, 0, 1))
             client.resetBaseVelocity(body, (0, 0, 0), (0, 0, 0))
         self._robot.place(scene.position, scene.yaw, scene.aperture, scene.grip)
         client.performCollisionDetection()
-        for body, pose in zip(self._bodies, scene.objects, strict=True):
+        for body, pose in zip(self._ids, scene.objects, strict=True):
             client.resetBasePositionAndOrientation(body, pose[:3].tolist(), pose[3:].tolist())
             client.resetBaseVelocity(body, (0, 0, 0), (0, 0, 0))
         client.performCollisionDetection()
+        self._areas = scene.areas
 
     def scene(self) -> Scene:
         """Returns the measured state."""
         position, yaw, aperture = self._robot.pose()
-        poses = [self._client.getBasePositionAndOrientation(body) for body in self._bodies]
-        objects = [(*where, *orientation) for where, orientation in poses]
-        return Scene(position, yaw, aperture, np.array(objects), self._robot.grip_target)
+        poses = [self._client.getBasePositionAndOrientation(body) for body in self._ids]
+        return Scene(
+            position=position,
+            yaw=yaw,
+            aperture=aperture,
+            objects=np.array([(*where, *orientation) for where, orientation in poses]),
+            grip=self._robot.grip_target,
+            names=tuple(name for name, _ in self._present),
+            scales=tuple(scale for _, scale in self._present),
+            areas=self._areas,
+        )
+
+    def settled(self, scene: Scene) -> Scene:
+        """Returns ``scene`` with its objects come to rest, the robot out of their way."""
+        aside = np.array(_OUT_OF_THE_WAY)
+        self.place(replace(scene, position=aside, yaw=0.0, aperture=0.0, grip=0.0))
+        still = 0
+        for _ in range(_PATIENCE):
+            self._client.stepSimulation()
+            still = 0 if self._in_motion() else still + 1
+            if still == _REST_STEPS:
+                break
+        return replace(scene, objects=self.scene().objects)
+
+    def dropped(self, scene: Scene) -> Scene:
+        """Returns ``scene`` after its objects have fallen, each when those before it lie still."""
+        scene = scene.named(self._bodies)
+        resting = scene.objects[:0]
+        for k, pose in enumerate(scene.objects):
+            falling = replace(
+                scene,
+                objects=np.concatenate((resting, pose[None])),
+                names=scene.names[: k + 1],
+                scales=scene.scales[: k + 1],
+            )
+            resting = self.settled(falling).objects
+        return replace(scene, objects=resting)
 
     def joint_values(self) -> np.ndarray:
         """Returns the values of all joints of the robot."""
@@ -96,18 +152,51 @@ class Simulation:
     def held(self) -> int | None:
         """Returns the index of the object that both fingers touch laterally, else None."""
         left, right = self._robot.fingers
-        for k, body in enumerate(self._bodies):
-            touching = {
+        for k, body in enumerate(self._ids):
+            fingers = {
                 contact[3]
                 for contact in self._client.getContactPoints(self._robot.body, body)
                 if contact[8] < _TOUCHING and abs(contact[7][2]) < _LATERAL_NORMAL
             }
-            if left in touching and right in touching:
+            if left in fingers and right in fingers:
                 return k
         return None
 
-    def _load_bin(self, workspace: Workspace) -> None:
-        client, bin_ = self._client, workspace.bin
+    def touching(self, first: int, second: int) -> bool:
+        """Tells whether two objects, by their indices, touch."""
+        contacts = self._client.getContactPoints(self._ids[first], self._ids[second])
+        return any(contact[8] < _TOUCHING for contact in contacts)
+
+    def _in_motion(self) -> bool:
+        for body in self._ids:
+            linear, angular = self._client.getBaseVelocity(body)
+            if max(map(abs, linear)) > _REST_SPEED or max(map(abs, angular)) > _REST_SPIN:
+                return True
+        return False
+
+    def _load(self, wanted: tuple[tuple[str, float], ...]) -> None:
+        """Makes the bodies of a scene, unless they are there."""
+        if wanted == self._present:
+            return
+        if self._loads + len(wanted) > _MAX_LOADS:
+            self._client.close()
+            self._connect()
+        for body in self._ids:
+            self._client.removeBody(body)
+        self._present, self._ids = (), []
+        bodies = {key: self._bodies[key[0]].scaled(key[1]) for key in wanted}
+        for key, body in bodies.items():
+            if key not in self._shapes:
+                self._shapes[key] = load_collision_shape(self._client, body)
+        self._ids = [
+            load_body(self._client, bodies[key], self._shapes[key], self._placeholder)
+            for key in wanted
+        ]
+        self._present = wanted
+        self._loads += len(wanted)
+
+    def _load_bin(self) -> None:
+        client, bin_ = self._client, self._workspace.bin
         depth = 0.25
         half = (1.0, 1.0, depth / 2)
         shape = client.createCollisionShape(client.GEOM_BOX, halfExtents=half)
@@ -122,15 +211,3 @@ class Simulation:
             turn = (0, 0, np.sin(quarter * np.pi / 4), np.cos(quarter * np.pi / 4))
             wall = client.createMultiBody(0, shape, baseOrientation=turn)
             client.changeDynamics(wall, -1, lateralFriction=bin_.wall_friction)
-
-    def _load_body(self, body: Body) -> int:
-        client = self._client
-        if body.shape.half_extents is not None:
-            geometry = {"halfExtents": body.shape.half_extents.tolist()}
-            shape = client.createCollisionShape(client.GEOM_BOX, **geometry)
-        else:
-            corners = body.shape.vertices.tolist()
-            shape = client.createCollisionShape(client.GEOM_MESH, vertices=corners)
-        loaded = client.createMultiBody(body.mass, shape)
-        client.changeDynamics(loaded, -1, lateralFriction=body.friction)
-        return loaded

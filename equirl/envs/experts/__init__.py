@@ -5,13 +5,28 @@ from __future__ import annotations
 from typing import Literal
 
 from equirl.envs.experts.base import Expert
+from equirl.envs.experts.block_in_bowl import BlockInBowlExpert
 from equirl.envs.experts.block_picking import BlockPickingExpert
+from equirl.envs.experts.block_pushing import BlockPushingExpert
+from equirl.envs.experts.clutter_grasping import ClutterGraspingExpert
 from equirl.envs.manipulation import ManipulationEnv
-from equirl.envs.tasks import BlockPicking, Task
+from equirl.envs.tasks import BlockInBowl, BlockPicking, BlockPushing, ClutterGrasping, Task
 
-EXPERTS: dict[type[Task], type[Expert]] = {BlockPicking: BlockPickingExpert}
+EXPERTS: dict[type[Task], type[Expert]] = {
+    BlockPicking: BlockPickingExpert,
+    ClutterGrasping: ClutterGraspingExpert,
+    BlockPushing: BlockPushingExpert,
+    BlockInBowl: BlockInBowlExpert,
+}
 
-__all__ = ["BlockPickingExpert", "Expert", "make_expert"]
+__all__ = [
+    "BlockInBowlExpert",
+    "BlockPickingExpert",
+    "BlockPushingExpert",
+    "ClutterGraspingExpert",
+    "Expert",
+    "make_expert",
+]
 
 
 def make_expert(

@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from equirl.envs.manipulation import ManipulationEnv
 from equirl.envs.scene import Scene
 
-OPEN, CLOSED = 1.0, -1.0
+OPEN, HALF_OPEN, CLOSED = 1.0, 0.0, -1.0
 
 
 class Expert(TensorDictModuleBase):
@@ -31,14 +31,21 @@ class Expert(TensorDictModuleBase):
         # In a list, or torch would register the environment as a sub-module.
         self._env = [env]
         self._horizontal_clip = horizontal_clip
+        self._episode: int | None = None
 
     @abstractmethod
     def plan(self, scene: Scene, held: int | None) -> np.ndarray:
         """Returns the action for a state, shape (5,)."""
 
+    def begin(self, rng: np.random.Generator) -> None:
+        """Forgets the last episode; ``rng`` serves all draws of the new one."""
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes ``action`` (5,) for the present state of the environment."""
         (env,) = self._env
+        if self._episode != env.episodes_begun:
+            self._episode = env.episodes_begun
+            self.begin(np.random.default_rng(env.episode_seed))
         action = self.plan(env.get_scene(), env.held_object())
         return tensordict.set("action", torch.tensor(action, dtype=torch.float32))
 

@@ -3,43 +3,143 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar
 
 import numpy as np
 
-from equirl.envs.objects import Body
-from equirl.envs.scene import Scene
+from equirl.envs.objects import Body, ObjectSet
+from equirl.envs.scene import Area, Scene
 
 
+class PlacementError(RuntimeError):
+    """No scene could be made of the task's numbers; the message says after how many tries."""
+
+
+@dataclass(frozen=True)
+class State:
+    """What is judged at the end of a step.
+
+    Attributes:
+        scene: the measured poses.
+        held: index of the object that both fingers touch laterally, or None.
+        touching: tells whether the objects of two indices touch each other.
+    """
+
+    scene: Scene
+    held: int | None
+    touching: Callable[[int, int], bool]
+
+
+@dataclass(frozen=True, kw_only=True)
 class Task(ABC):
     """A task: which bodies there are, where they start, what success is.
 
+    The fields of a task are its numbers (m, kg, rad), checked at construction.
+
     Attributes:
-        bodies: the bodies, in the order of `Scene.objects`; they collide and are drawn.
         view: length of a side of the depth image, m.
         margin: an object that is not held and leaves the workspace by more than this (m) ends the
             episode.
+        start_half_width: positions are drawn within +-this of the centre, m.
+        placement_tries: draws of a scene before `PlacementError`.
     """
 
-    bodies: tuple[Body, ...]
-    view: float
-    margin: float
+    view: float = 0.30
+    margin: float = 0.0
+    start_half_width: float = 0.09
+    placement_tries: int = 1000
+
+    #: Options that the paper's own implementation runs with, for ``mode=paper``.
+    paper_options: ClassVar[Mapping[str, Any]] = {}
+    #: Whether objects are dropped where `sample` puts them, one by one, and come to rest.
+    drops_objects: ClassVar[bool] = False
+    #: The areas marked in the depth image, in the order of `Scene.areas`.
+    areas: ClassVar[tuple[Area, ...]] = ()
+
+    def __post_init__(self) -> None:
+        self.require_positive("view", "placement_tries")
+        self.require_non_negative("margin", "start_half_width")
+
+    @property
+    @abstractmethod
+    def bodies(self) -> ObjectSet:
+        """The bodies that scenes are made of."""
 
     @abstractmethod
-    def sample(self, rng: np.random.Generator) -> np.ndarray:
-        """Draws the poses at the start of an episode.
+    def sample(self, rng: np.random.Generator, home: Scene) -> Scene:
+        """Draws a new scene.
 
         Args:
             rng: the only source of randomness.
+            home: the robot at the start of an episode, without objects.
 
         Returns:
-            One row (x, y, z, qx, qy, qz, qw) a body, shape (N, 7), m.
+            ``home`` with objects and areas.
+
+        Raises:
+            PlacementError: if they do not fit.
         """
 
     @abstractmethod
-    def succeeded(self, scene: Scene, held: int | None) -> bool:
-        """Judges the state at the end of a step.
+    def succeeded(self, state: State) -> bool:
+        """Judges the state at the end of a step."""
+
+    def continued(self, state: State, succeeded: bool, episodes: int) -> Scene | None:
+        """Returns what the next episode of the same scene starts with.
 
         Args:
-            scene: the measured state.
-            held: index of the object that both fingers touch laterally, or None.
+            state: the end of the last episode.
+            succeeded: whether that was a success.
+            episodes: episodes played on this scene so far.
+
+        Returns:
+            The scene (its gripper is sent home), or None for a new scene: the default.
         """
+        return None
+
+    def require(self, name: str, valid: bool, expected: str) -> None:
+        """Refuses the value of a field unless ``valid``."""
+        if not valid:
+            raise ValueError(f"{name} must be {expected}, got {getattr(self, name)!r}")
+
+    def require_positive(self, *names: str) -> None:
+        """Refuses fields that are not positive, finite numbers of the type of their default."""
+        for name in names:
+            self.require(name, self._number(name) > 0, f"{self._kind(name)} above 0")
+
+    def require_non_negative(self, *names: str) -> None:
+        """Refuses fields that are not finite numbers, 0 or more, of the type of their default."""
+        for name in names:
+            self.require(name, self._number(name) >= 0, f"{self._kind(name)}, 0 or more")
+
+    def _kind(self, name: str) -> str:
+        (default,) = (each.default for each in fields(self) if each.name == name)
+        return "an integer" if isinstance(default, int) else "a finite number"
+
+    def _number(self, name: str) -> float:
+        """Returns the value of a field, or -inf when it is no number of the right kind."""
+        value = getattr(self, name)
+        allowed = int if self._kind(name) == "an integer" else (int, float)
+        right = isinstance(value, allowed) and not isinstance(value, bool)
+        return value if right and np.isfinite(value) else -np.inf
+
+
+def rejection_sample(draw: Callable[[], np.ndarray | None], tries: int, what: str) -> np.ndarray:
+    """Returns the first result of ``draw`` that is not None.
+
+    Raises:
+        PlacementError: after ``tries`` draws; the message says what was asked for.
+    """
+    for _ in range(tries):
+        drawn = draw()
+        if drawn is not None:
+            return drawn
+    raise PlacementError(f"no place in {tries} tries for {what}")
+
+
+def lying(body: Body, x: float, y: float, yaw: float) -> np.ndarray:
+    """Returns the pose (7,) of ``body`` on the floor, upright, at (x, y) m and ``yaw`` rad."""
+    lowest = body.vertices[:, 2].min()
+    return np.array([x, y, -lowest, 0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)])

@@ -2,32 +2,40 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+from functools import cached_property
+
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from equirl.envs.objects import cube
+from equirl.envs.objects import ObjectSet
 from equirl.envs.scene import Scene
-from equirl.envs.tasks.base import Task
+from equirl.envs.tasks.base import State
+from equirl.envs.tasks.block_task import BlockTask
 
 
-class BlockPicking(Task):
-    """A cube of 5 cm lies in the bin; success is holding it with the gripper above 0.15 m."""
+@dataclass(frozen=True, kw_only=True)
+class BlockPicking(BlockTask):
+    """A cube lies in the bin; success is holding it with the gripper high enough.
 
-    view = 0.30
-    margin = 0.0
-    cube_side = 0.05
-    start_half_width = 0.09
-    lift_height = 0.15
+    Attributes:
+        lift_height: the end effector must be above this, m.
+    """
 
-    def __init__(self) -> None:
-        self.bodies = (cube(self.cube_side, mass=0.1, friction=1.0),)
+    lift_height: float = 0.15
 
-    def sample(self, rng: np.random.Generator) -> np.ndarray:
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.require_positive("lift_height")
+
+    @cached_property
+    def bodies(self) -> ObjectSet:
+        """The cube."""
+        return ObjectSet([self.cube], "Block Picking")
+
+    def sample(self, rng: np.random.Generator, home: Scene) -> Scene:
         """Draws the cube's x, y and yaw."""
-        x, y = rng.uniform(-self.start_half_width, self.start_half_width, size=2)
-        orientation = Rotation.from_euler("z", rng.uniform(-np.pi / 4, np.pi / 4)).as_quat()
-        return np.array([[x, y, self.cube_side / 2, *orientation]])
+        return replace(home, objects=[self.sample_cube(rng)])
 
-    def succeeded(self, scene: Scene, held: int | None) -> bool:
+    def succeeded(self, state: State) -> bool:
         """Tells whether the cube is held high enough."""
-        return held is not None and scene.position[2] > self.lift_height
+        return state.held is not None and state.scene.position[2] > self.lift_height

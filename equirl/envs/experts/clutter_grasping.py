@@ -1,0 +1,87 @@
+"""Planner for Clutter Grasping: to any object on top, close on arrival, lift, or try another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from equirl.envs.experts.base import CLOSED, OPEN, Expert, nearest_symmetric_yaw
+from equirl.envs.scene import Scene
+
+
+@dataclass
+class _Attempt:
+    target: int  # index of the object
+    yaw: float  # rad
+    lowering: float  # m below the object's centre
+    last: np.ndarray | None = None  # end effector position when the last action was chosen
+    closed: bool = False  # whether the gripper was told to close
+
+
+class ClutterGraspingExpert(Expert):
+    """Draws an object, a yaw and a depth for each attempt.
+
+    The yaw is independent of the object's: the planner is sub-optimal by design, as the paper's.
+    """
+
+    _on_top = 0.027  # m: an object is not on top if the centre of a higher one is as near
+    _deepest = 0.02  # m, the grasp is lowered by up to this
+    _clear = 0.09  # m, height from which the next object is approached
+    _reach = 0.05  # m, horizontal distance from which it comes down
+    _stuck = 0.004  # m: a move shorter than this was broken off
+
+    def begin(self, rng: np.random.Generator) -> None:
+        """Forgets the last episode."""
+        self._rng = rng
+        self._attempt: _Attempt | None = None
+        self._failed: int | None = None
+
+    def plan(self, scene: Scene, held: int | None) -> np.ndarray:
+        """Returns the action for a state, shape (5,)."""
+        if held is not None:
+            return np.array([CLOSED, 0.0, 0.0, 1.0, 0.0])
+        if self._attempt is not None and self._attempt.closed:
+            self._failed, self._attempt = self._attempt.target, None
+        if self._attempt is None:
+            if self._failed is not None and scene.position[2] < self._clear:
+                return np.array([OPEN, 0.0, 0.0, 1.0, 0.0])
+            self._attempt = self._choose(scene)
+        return self._approach(scene, self._attempt)
+
+    def _approach(self, scene: Scene, attempt: _Attempt) -> np.ndarray:
+        blocked = attempt.last is not None and (
+            np.linalg.norm(scene.position - attempt.last) < self._stuck
+        )
+        attempt.last = scene.position
+        if blocked:  # something is in the way: grasp what is there
+            action = np.array([CLOSED, 0.0, 0.0, 0.0, 0.0])
+        else:
+            where = scene.objects[attempt.target, :3] - (0, 0, attempt.lowering)
+            above = np.hypot(*(where[:2] - scene.position[:2])) < self._reach
+            if not above:
+                where[2] = self._clear  # over the others
+            arrived = CLOSED if above else OPEN
+            action = self._toward(scene, where, attempt.yaw, gripper=OPEN, arrived=arrived)
+        attempt.closed = action[0] == CLOSED
+        return action
+
+    def _choose(self, scene: Scene) -> _Attempt:
+        """Draws the next attempt; another object than the last, if there is one on top."""
+        candidates = self._topmost(scene)
+        others = [target for target in candidates if target != self._failed]
+        target = int(self._rng.choice(others or candidates))
+        yaw = nearest_symmetric_yaw(self._draw_yaw(scene, target), scene.yaw, np.pi)
+        return _Attempt(target, yaw, self._rng.uniform(0, self._deepest))
+
+    def _topmost(self, scene: Scene) -> list[int]:
+        """Returns the objects over which there is no other."""
+        where = scene.objects[:, :3]
+        near = (
+            np.hypot(*(where[:, None, :2] - where[None, :, :2]).transpose(2, 0, 1)) < self._on_top
+        )
+        covered = (near & (where[None, :, 2] > where[:, None, 2])).any(1)
+        return np.flatnonzero(~covered).tolist()
+
+    def _draw_yaw(self, scene: Scene, target: int) -> float:
+        return self._rng.uniform(-np.pi / 2, np.pi / 2)

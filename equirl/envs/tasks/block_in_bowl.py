@@ -1,0 +1,94 @@
+"""Block in Bowl: put a cube into a bowl (appendix of the paper, simulation tasks)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+
+from equirl.envs.objects import Body, ObjectSet, bowl
+from equirl.envs.scene import Scene
+from equirl.envs.tasks.base import State, lying, rejection_sample
+from equirl.envs.tasks.block_task import BlockTask
+
+
+@dataclass(frozen=True, kw_only=True)
+class BlockInBowl(BlockTask):
+    """A cube and a bowl lie in the bin; success is the cube in the upright bowl, released.
+
+    Attributes:
+        bowl_width: width of the bowl between opposite flats of its rim, m.
+        bowl_height: m.
+        bowl_mass: kg.
+        bowl_friction: lateral friction.
+        bowl_half_width: the bowl's centre is drawn within +-this of the bin's, m.
+        bowl_distance: least distance of the centres of cube and bowl at the start, m.
+        reach: greatest distance of the two centres, in x and y, that is a success, m.
+        max_tilt: greatest angle between the bowl's axis and the vertical, rad.
+        require_release: whether a cube that is still held is no success yet.
+    """
+
+    view: float = 0.45
+    margin: float = 0.05
+    bowl_width: float = 0.16
+    bowl_height: float = 0.07
+    bowl_mass: float = 0.1
+    bowl_friction: float = 1.0
+    bowl_half_width: float = 0.065
+    bowl_distance: float = 0.17
+    reach: float = 0.03
+    max_tilt: float = np.pi / 9
+    require_release: bool = True
+
+    paper_options: ClassVar[Mapping[str, Any]] = {"require_release": False}
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.require_positive("bowl_width", "bowl_height", "bowl_mass", "reach", "max_tilt")
+        self.require_non_negative("bowl_friction", "bowl_half_width", "bowl_distance")
+        self.require("require_release", isinstance(self.require_release, bool), "True or False")
+        self.require("bowl_width", self.bowl_width > 2 * self.cube_side, "twice the cube's side")
+
+    @cached_property
+    def bowl(self) -> Body:
+        """The bowl."""
+        return bowl(self.bowl_width, self.bowl_height, self.bowl_mass, self.bowl_friction)
+
+    @cached_property
+    def bodies(self) -> ObjectSet:
+        """The cube and the bowl."""
+        return ObjectSet([self.cube, self.bowl], "Block in Bowl")
+
+    def sample(self, rng: np.random.Generator, home: Scene) -> Scene:
+        """Draws the cube's x, y and yaw and the bowl's x and y."""
+
+        def draw() -> np.ndarray | None:
+            cube = self.sample_cube(rng)
+            x, y = rng.uniform(-self.bowl_half_width, self.bowl_half_width, size=2)
+            apart = np.hypot(*(cube[:2] - (x, y))) >= self.bowl_distance
+            return np.stack((cube, lying(self.bowl, x, y, 0.0))) if apart else None
+
+        objects = rejection_sample(
+            draw,
+            self.placement_tries,
+            f"a bowl within ±{self.bowl_half_width} m that is bowl_distance={self.bowl_distance} m "
+            f"from a cube within ±{self.start_half_width} m",
+        )
+        return replace(home, objects=objects)
+
+    def succeeded(self, state: State) -> bool:
+        """Tells whether the cube lies in the upright bowl and, if asked for, is released."""
+        cube, bowl = state.scene.objects
+        if self.require_release and state.held == 0:
+            return False
+        inside = np.hypot(*(cube[:2] - bowl[:2])) < self.reach
+        return bool(inside and tilt(bowl[3:]) < self.max_tilt and state.touching(0, 1))
+
+
+def tilt(quaternion: np.ndarray) -> float:
+    """Returns the angle (rad) between a body's z axis and the vertical."""
+    x, y, _, _ = quaternion
+    return float(np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1)))
