@@ -27,6 +27,7 @@ class EnvConfig:
     image_size: int = 128  # pixels a side; networks take 16, 32, 64, 128 and 256
     robot: str = "panda"  # "panda" or "hand", a free-flying gripper
     max_steps: int = 50
+    options: dict[str, Any] = field(default_factory=dict)  # numbers of the task, equirl/envs/tasks
 
 
 @dataclass
@@ -156,7 +157,7 @@ def validate(config: Config) -> Config:
     Raises:
         ConfigError: Names the first key whose value no run can have, and what it takes.
     """
-    from equirl.envs.tasks import TASKS
+    from equirl.envs.tasks import TASKS, make_task
     from equirl.modules.backend import BACKENDS
     from equirl.modules.layout import check_sizes
     from equirl.symmetry import SymmetryGroup
@@ -175,6 +176,10 @@ def validate(config: Config) -> Config:
         raise ConfigError(f"group={config.group}: {error}") from None
     _choice("mode", config.mode, "strict", "paper")
     _choice("env.task", config.env.task, *TASKS)
+    try:
+        make_task(config.env.task, **config.env.options)
+    except (ValueError, ImportError) as error:
+        raise ConfigError(f"env.options: {error}") from None
     _choice("env.robot", config.env.robot, "panda", "hand")
     _choice("method", config.method.name, "equivariant", "cnn")
     _choice("algorithm", config.algorithm.name, "sac")
@@ -311,5 +316,7 @@ def register() -> None:
     from hydra.core.config_store import ConfigStore
 
     store = ConfigStore.instance()
-    store.store(name="train_schema", node=TrainJob)
+    train = OmegaConf.structured(TrainJob)
+    OmegaConf.set_struct(train.env.options, False)  # the task itself checks their names
+    store.store(name="train_schema", node=train)
     store.store(name="evaluate_schema", node=EvaluateJob)

@@ -33,17 +33,19 @@ _failed: list[str] = []  # jobs of a multirun, each with its reason
 def main(values: DictConfig) -> None:
     """Runs one training job; a problem the user can mend ends in one sentence."""
     from equirl.collectors import DemonstrationError
+    from equirl.envs import PlacementError
     from equirl.training import CheckpointError, FolderError, train
 
     logging.getLogger("equirl").addHandler(_log)
     logging.getLogger("equirl").setLevel(logging.INFO)
+    mendable = (ConfigError, FolderError, CheckpointError, DemonstrationError, PlacementError)
     multirun = HydraConfig.get().mode == RunMode.MULTIRUN
     folder = None
     try:
         config, folder = _job(values, multirun)
         print(f"run folder: {folder}", flush=True)
         outcome = train(config, folder)
-    except (ConfigError, FolderError, CheckpointError, DemonstrationError) as error:
+    except mendable as error:
         print(f"error: {error}", file=sys.stderr, flush=True)
         if not multirun:
             sys.exit(1)

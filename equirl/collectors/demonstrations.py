@@ -14,6 +14,8 @@ from torchrl.envs import EnvBase
 
 from equirl.data import TRANSITION_KEYS
 
+from .scene_log import SceneLog
+
 
 class DemonstrationError(RuntimeError):
     """The expert does not solve the environment it was given."""
@@ -25,9 +27,10 @@ class DemonstrationCollector(BaseCollector):
     An episode has shape [T] and the keys of `equirl.data.TRANSITION_KEYS`, ``expert`` True. It
     is successful when its last reward is positive.
 
-    Attempt k is a function of ``seed`` and k alone (given a deterministic policy): the collector
-    derives the environment's seed for it and leaves the environment in the attempt's final state.
-    Iterating again goes on with further episodes only after `set_seed` or `load_state_dict`.
+    The demonstrations are a function of ``seed`` alone (given a policy that depends on the
+    environment's seed only): the collector seeds each scene, on which an environment may play
+    several episodes (see `SceneLog`), and leaves it in the last attempt's final state. Iterating
+    again goes on with further episodes only after `set_seed` or `load_state_dict`.
 
     Example:
         >>> env = make_env("block_picking", seed=0)
@@ -80,7 +83,7 @@ class DemonstrationCollector(BaseCollector):
         self.replay_buffer = replay_buffer
         self._episodes = episodes
         self._max_failures = max_failures
-        self._seeds = seeds
+        self._scenes = SceneLog(env, seeds or self._scene_seed)
         self.closed = False
         self.set_seed(seed)
 
@@ -115,19 +118,16 @@ class DemonstrationCollector(BaseCollector):
     @torch.no_grad()
     def _attempt(self) -> TensorDictBase:
         """Runs the next attempt and returns its transitions, shape [T]."""
-        self.env.set_seed(self._scene_seed(self.attempted), static_seed=True)
-        self.attempted += 1
         transitions = []
-        current, done = self.env.reset(), False
+        current, done = self._scenes.begin(self.attempted), False
+        self.attempted += 1
         while not done:
-            step = self.env.step(self.policy(current.copy()))
+            step = self._scenes.step(self.policy(current.copy()))
             transitions.append(self._transition(step))
             current, done = step["next"].exclude("reward"), step["next", "done"].item()
         return torch.stack(transitions)
 
     def _scene_seed(self, attempt: int) -> int:
-        if self._seeds is not None:
-            return self._seeds(attempt)
         root = np.random.SeedSequence(self._seed, spawn_key=(attempt,))
         return int(root.generate_state(1)[0])
 
@@ -147,12 +147,16 @@ class DemonstrationCollector(BaseCollector):
         self._seed = int(seed)
         self.attempted = 0
         self.episodes_collected = 0
+        self._scenes.forget()
         return seed if static_seed else seed + 1
 
     def state_dict(self) -> OrderedDict:
         """Returns what continues the collection after the episodes yielded so far."""
         return OrderedDict(
-            seed=self._seed, attempted=self.attempted, episodes_collected=self.episodes_collected
+            seed=self._seed,
+            attempted=self.attempted,
+            episodes_collected=self.episodes_collected,
+            scene=self._scenes.state_dict(),
         )
 
     def load_state_dict(self, state_dict: OrderedDict) -> None:
@@ -160,6 +164,7 @@ class DemonstrationCollector(BaseCollector):
         self._seed = state_dict["seed"]
         self.attempted = state_dict["attempted"]
         self.episodes_collected = state_dict["episodes_collected"]
+        self._scenes.load_state_dict(state_dict["scene"])
 
     def shutdown(
         self, timeout: float | None = None, close_env: bool = True, raise_on_error: bool = True

@@ -14,6 +14,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from equirl.data import TRANSITION_KEYS
 
+from .scene_log import SceneLog
+
 __all__ = ["Episode", "OnlineCollector"]
 
 
@@ -31,9 +33,9 @@ class Episode:
 class OnlineCollector:
     """Steps one environment with a stochastic policy and hands out single transitions.
 
-    Every episode starts from a seed of its own, so an open episode is its number and
-    the actions taken: that is all its state dict holds, and loading one rebuilds the
-    episode in the simulator by replaying it.
+    Every scene starts from a seed of its own, so an open episode is the number of the scene's
+    first one and the actions taken since: that is all its state dict holds, and loading one
+    rebuilds the episode in the simulator by replaying them.
 
     Args:
         env: A single environment (batch size ``()``).
@@ -54,11 +56,10 @@ class OnlineCollector:
     ):
         self.env = env
         self.policy = policy
-        self.seeds = seeds
         self.discount = discount
         self.device = device
         self.episode = 0
-        self._actions: list[torch.Tensor] = []
+        self._scenes = SceneLog(env, seeds)
         self._rewards: list[float] = []
         self._current: TensorDictBase | None = None
 
@@ -69,7 +70,7 @@ class OnlineCollector:
             The current step, with keys of the observation and ``action``.
         """
         if self._current is None:
-            self._current = self._begin()
+            self._current = self._scenes.begin(self.episode)
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
             return self.policy(self._current.copy().to(self.device))
 
@@ -85,36 +86,33 @@ class OnlineCollector:
         """
         assert self._current is not None
         taken = self._current.copy().set("action", acted["action"].detach().cpu())
-        stepped = self._take(taken)
+        stepped = self._scenes.step(taken)
+        self._note(stepped)
         transition = stepped.copy().set("expert", torch.zeros(1, dtype=torch.bool))
         transition = transition.select(*TRANSITION_KEYS).unsqueeze(0)
         summary = self._close() if stepped["next", "done"].item() else None
         return transition, summary
 
     def state_dict(self) -> dict[str, Any]:
-        """The open episode: its number and the actions taken, shape (t, 5)."""
-        actions = torch.stack(self._actions) if self._actions else torch.zeros(0)
-        return {"episode": self.episode, "actions": actions}
+        """The number of the next or open episode, and what rebuilds its scene."""
+        return {
+            "episode": self.episode,
+            "open": len(self._rewards) > 0,
+            "scene": self._scenes.state_dict(),
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Rebuilds the open episode from its seed and its actions."""
+        """Rebuilds the scene, and the open episode, from its seed and the actions taken."""
         self.episode = state["episode"]
-        self._actions, self._rewards, self._current = [], [], None
-        for action in state["actions"]:
-            if self._current is None:
-                self._current = self._begin()
-            self._take(self._current.copy().set("action", action))
+        self._rewards, self._current = [], None
+        steps = self._scenes.load_state_dict(state["scene"])
+        if state["open"]:
+            for stepped in steps:
+                self._note(stepped)
 
-    def _begin(self) -> TensorDictBase:
-        self.env.set_seed(self.seeds(self.episode), static_seed=True)
-        return self.env.reset()
-
-    def _take(self, taken: TensorDictBase) -> TensorDictBase:
-        stepped = self.env.step(taken)
-        self._actions.append(taken["action"])
+    def _note(self, stepped: TensorDictBase) -> None:
         self._rewards.append(stepped["next", "reward"].item())
         self._current = step_mdp(stepped)
-        return stepped
 
     def _close(self) -> Episode:
         rewards = self._rewards
@@ -126,5 +124,5 @@ class OnlineCollector:
             success=rewards[-1] > 0,
         )
         self.episode += 1
-        self._actions, self._rewards, self._current = [], [], None
+        self._rewards, self._current = [], None
         return summary

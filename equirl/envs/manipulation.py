@@ -153,7 +153,8 @@ class ManipulationEnv(EnvBase):
     def _sent_home(self, scene: Scene | None) -> Scene:
         """Returns ``scene`` with the robot where episodes start; without objects if None."""
         space = self.workspace
-        home = Scene([0.0, 0.0, space.home_height], 0.0, space.max_aperture, np.zeros((0, 7)))
+        position = np.array([0.0, 0.0, space.home_height])
+        home = Scene(position, 0.0, space.max_aperture, np.zeros((0, 7)))
         if scene is None:
             return home
         robot = {name: getattr(home, name) for name in ("position", "yaw", "aperture", "grip")}

@@ -14,7 +14,7 @@ import torch
 
 __all__ = ["CheckpointError", "check_same_config", "load_checkpoint", "save_checkpoint"]
 
-_FORMAT = 1
+_FORMAT = 2
 
 #: Keys that may change when a run is resumed: none touches what has been learned.
 _FREE_KEYS = ("steps", "device", "threads", "backend", "checkpoint_every")

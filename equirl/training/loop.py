@@ -17,6 +17,7 @@ from equirl.collectors import DemonstrationCollector, Episode, OnlineCollector
 from equirl.config import Config, flatten
 from equirl.data import load_replay_state, make_replay_buffer, replay_state
 from equirl.envs import ManipulationEnv, make_env, make_expert
+from equirl.envs.tasks import TASKS
 from equirl.modules import shared_filters
 
 from .checkpoint import CheckpointError, check_same_config, load_checkpoint, save_checkpoint
@@ -34,14 +35,19 @@ PARTS = ("demonstrations", "act", "environment", "replay", "update", "evaluation
 
 
 def make_run_env(config: Config, **options: Any) -> ManipulationEnv:
-    """The environment of a run; ``paper`` mode stores time-outs as terminal."""
+    """The environment of a run.
+
+    ``paper`` mode stores time-outs as terminal and judges as the paper's implementation does.
+    """
+    paper = config.mode == "paper"
+    defaults = TASKS[config.env.task].paper_options if paper else {}
     return make_env(
         config.env.task,
         image_size=config.env.image_size,
         robot=cast(Literal["panda", "hand"], config.env.robot),
         max_steps=config.env.max_steps,
-        time_limit="terminate" if config.mode == "paper" else "truncate",
-        **options,
+        time_limit="terminate" if paper else "truncate",
+        **{**defaults, **config.env.options, **options},
     )
 
 

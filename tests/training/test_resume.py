@@ -119,7 +119,7 @@ def test_checkpoints_load_without_executing_code(tmp_path):
             return print, ("executed",)
 
     path = tmp_path / "evil.pt"
-    torch.save({"format": 1, "payload": Payload()}, path)
+    torch.save({"format": 2, "payload": Payload()}, path)
     with pytest.raises(CheckpointError):
         load_checkpoint(path)
 

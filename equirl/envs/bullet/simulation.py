@@ -181,8 +181,8 @@ class Simulation:
         if self._loads + len(wanted) > _MAX_LOADS:
             self._client.close()
             self._connect()
-        for body in self._ids:
-            self._client.removeBody(body)
+        for loaded in self._ids:
+            self._client.removeBody(loaded)
         self._present, self._ids = (), []
         bodies = {key: self._bodies[key[0]].scaled(key[1]) for key in wanted}
         for key, body in bodies.items():

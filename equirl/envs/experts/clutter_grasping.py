@@ -77,11 +77,9 @@ class ClutterGraspingExpert(Expert):
     def _topmost(self, scene: Scene) -> list[int]:
         """Returns the objects over which there is no other."""
         where = scene.objects[:, :3]
-        near = (
-            np.hypot(*(where[:, None, :2] - where[None, :, :2]).transpose(2, 0, 1)) < self._on_top
-        )
-        covered = (near & (where[None, :, 2] > where[:, None, 2])).any(1)
-        return np.flatnonzero(~covered).tolist()
+        apart = where[:, None] - where[None]
+        over = (np.hypot(apart[..., 0], apart[..., 1]) < self._on_top) & (apart[..., 2] < 0)
+        return np.flatnonzero(~over.any(1)).tolist()
 
     def _draw_yaw(self, scene: Scene, target: int) -> float:
         return self._rng.uniform(-np.pi / 2, np.pi / 2)

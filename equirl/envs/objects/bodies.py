@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -103,7 +104,7 @@ class Body:
 
     @classmethod
     def centred(
-        cls, pieces: Iterable[ConvexPolyhedron], mass: float, friction: float, **options
+        cls, pieces: Iterable[ConvexPolyhedron], mass: float, friction: float, **options: Any
     ) -> Body:
         """Returns the body of ``pieces``, given in any frame, moved to its centre of mass."""
         pieces = tuple(pieces)
@@ -132,7 +133,7 @@ class Body:
     def inertia(self) -> np.ndarray:
         """Moments of inertia about the body's axes, shape (3,), kg m^2."""
         volumes, _, seconds = zip(*(piece.moments() for piece in self.pieces), strict=True)
-        second = self.mass / sum(volumes) * sum(np.diag(s) for s in seconds)
+        second = self.mass / sum(volumes) * np.sum([np.diag(s) for s in seconds], axis=0)
         return second.sum() - second
 
     @property

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from equirl.envs.objects.bodies import Body, ConvexPolyhedron
@@ -33,10 +35,9 @@ def bowl(width: float, height: float, mass: float, friction: float) -> Body:
     )
     pieces = [ConvexPolyhedron.hull(foot)]
     levels = [(half * r, height * z) for r, z in _PROFILE]
-    for (r0, z0), (r1, z1) in zip(levels[:-1], levels[1:], strict=True):
-        rings = [
-            _octagon(r, z) for r, z in ((r0, z0), (r1, z1), (r0 - _WALL, z0), (r1 - _WALL, z1))
-        ]
+    for (r0, z0), (r1, z1) in pairwise(levels):
+        section = ((r0, z0), (r1, z1), (r0 - _WALL, z0), (r1 - _WALL, z1))
+        rings = [_octagon(r, z) for r, z in section]
         for k in range(8):
             corners = [ring[j] for ring in rings for j in (k, (k + 1) % 8)]
             pieces.append(ConvexPolyhedron.hull(np.array(corners)))

@@ -34,7 +34,7 @@ class BlockPicking(BlockTask):
 
     def sample(self, rng: np.random.Generator, home: Scene) -> Scene:
         """Draws the cube's x, y and yaw."""
-        return replace(home, objects=[self.sample_cube(rng)])
+        return replace(home, objects=self.sample_cube(rng)[None])
 
     def succeeded(self, state: State) -> bool:
         """Tells whether the cube is held high enough."""

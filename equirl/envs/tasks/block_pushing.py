@@ -65,7 +65,7 @@ class BlockPushing(BlockTask):
             f"a goal within ±{self.goal_half_width} m that is goal_distance={self.goal_distance} m "
             f"from a cube within ±{self.start_half_width} m",
         )
-        return replace(home, objects=[drawn[:7]], areas=[[*drawn[7:], 0.0]])
+        return replace(home, objects=drawn[None, :7], areas=np.array([[*drawn[7:], 0.0]]))
 
     def succeeded(self, state: State) -> bool:
         """Tells whether the cube lies in the goal area and is not held."""
