@@ -125,6 +125,22 @@ def test_one_finger_alone_does_not_hold(simulation):
     assert simulation.held() is None
 
 
+def test_pushing_with_both_fingers_does_not_hold(simulation):
+    # The fingers separate along x and push along y: both touch the same face.
+    simulation.place(Scene([0, -0.06, 0.03], 0.0, 0.04, [[0, 0, 0.025, 0, 0, 0, 1]]))
+    touched = []
+
+    def step():
+        simulation._client.stepSimulation()
+        assert simulation.held() is None
+        contacts = simulation._client.getContactPoints(simulation._robot.body)
+        touched.append({contact[3] for contact in contacts})
+
+    simulation._robot.move(np.array([0, -0.01, 0.03]), 0.0, step)
+    assert set(simulation._robot.fingers) in touched
+    assert simulation.scene().objects[0, 1] > 0.01
+
+
 def test_a_pushed_cube_slides_back_off_the_walls(simulation):
     simulation.place(Scene([0.0, 0, 0.2], 0.0, 0.0, [[0.17, 0, 0.07, 0, 0, 0, 1]]))
     for _ in range(6):

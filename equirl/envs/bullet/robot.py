@@ -15,10 +15,11 @@ FINGER_FRICTION = 1.0
 FINGER_SPEED = 0.2  # m/s
 MOVE_STEPS = 24  # simulation steps of one move: 0.2 s
 MAX_GRIP_STEPS = 40
-# A move is broken off, and a little of it taken back, when the contacts push the robot harder than
-# this. Strong as it is, the arm would otherwise press a cube through the floor.
+# Strong as it is, the arm would press a cube through the floor. When the contacts push harder than
+# this, it takes a little of the move back and tries again, a few times: what can give way does.
 FORCE_LIMIT = 40.0  # N
 _RETREAT_STEPS = 4
+_ATTEMPTS = 5
 _FINGER_JOINTS = ("panda_finger_joint1", "panda_finger_joint2")
 
 
@@ -94,7 +95,7 @@ class Robot:
     def move(self, position: np.ndarray, yaw: float, step: Callable[[], None]) -> None:
         """Moves the end effector in a straight line, smoothly, in `MOVE_STEPS` steps.
 
-        Stops short when it meets a resistance of more than `FORCE_LIMIT`.
+        Stops short when it meets a resistance of more than `FORCE_LIMIT` that does not give way.
 
         Args:
             position: where to, shape (3,), m.
@@ -109,15 +110,18 @@ class Robot:
         velocities = np.zeros_like(joints)
         velocities[:-2:2] = (joints[2::2] - joints[:-2:2]) / (2 * self._time_step)
         # A command every second step; the motors track the velocity in between.
-        for i in range(MOVE_STEPS):
+        i, attempts = 0, 0
+        while i < MOVE_STEPS and attempts < _ATTEMPTS:
             if i % 2 == 0:
                 self._drive_arm(joints[i + 1], velocities[i])
             step()
+            i += 1
             if self._resistance() > FORCE_LIMIT:
-                self._drive_arm(joints[max(i - _RETREAT_STEPS, 0)], np.zeros_like(joints[0]))
+                attempts += 1
+                i = max(i - 1 - _RETREAT_STEPS, 0) // 2 * 2
+                self._drive_arm(joints[i], np.zeros_like(joints[0]))
                 for _ in range(_RETREAT_STEPS):
                     step()
-                return
 
     def _resistance(self) -> float:
         """Returns the norm of the net normal force of all contacts on the robot, N."""

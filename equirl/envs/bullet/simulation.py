@@ -150,17 +150,21 @@ class Simulation:
         self._robot.grip(aperture, self._client.stepSimulation)
 
     def held(self) -> int | None:
-        """Returns the index of the object that both fingers touch laterally, else None."""
-        left, right = self._robot.fingers
+        """Returns the index of the object that the fingers squeeze, else None.
+
+        Both touch it laterally, and from opposite sides: pushing with both is not holding.
+        """
         for k, body in enumerate(self._ids):
-            fingers = {
-                contact[3]
-                for contact in self._client.getContactPoints(self._robot.body, body)
-                if contact[8] < _TOUCHING and abs(contact[7][2]) < _LATERAL_NORMAL
-            }
-            if left in fingers and right in fingers:
+            left, right = (self._lateral_normals(body, finger) for finger in self._robot.fingers)
+            if any(a[0] * b[0] + a[1] * b[1] < 0 for a in left for b in right):
                 return k
         return None
+
+    def _lateral_normals(self, body: int, finger: int) -> list[tuple[float, float, float]]:
+        """Returns the near-horizontal normals at the contacts of a body with a finger."""
+        contacts = self._client.getContactPoints(self._robot.body, body, finger)
+        normals = [contact[7] for contact in contacts if contact[8] < _TOUCHING]
+        return [normal for normal in normals if abs(normal[2]) < _LATERAL_NORMAL]
 
     def touching(self, first: int, second: int) -> bool:
         """Tells whether two objects, by their indices, touch."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
@@ -11,6 +11,8 @@ import numpy as np
 
 from equirl.envs.objects import Body, ObjectSet
 from equirl.envs.scene import Area, Scene
+
+_BATCH = 256  # points drawn at a time
 
 
 class PlacementError(RuntimeError):
@@ -23,7 +25,7 @@ class State:
 
     Attributes:
         scene: the measured poses.
-        held: index of the object that both fingers touch laterally, or None.
+        held: index of the object that the fingers squeeze, or None.
         touching: tells whether the objects of two indices touch each other.
     """
 
@@ -49,7 +51,7 @@ class Task(ABC):
     view: float = 0.30
     margin: float = 0.0
     start_half_width: float = 0.09
-    placement_tries: int = 1000
+    placement_tries: int = 20_000
 
     #: Options that the paper's own implementation runs with, for ``mode=paper``.
     paper_options: ClassVar[Mapping[str, Any]] = {}
@@ -126,16 +128,34 @@ class Task(ABC):
         return value if right and np.isfinite(value) else -np.inf
 
 
-def rejection_sample(draw: Callable[[], np.ndarray | None], tries: int, what: str) -> np.ndarray:
-    """Returns the first result of ``draw`` that is not None.
+def rejection_sample(
+    rng: np.random.Generator,
+    half_widths: Sequence[float],
+    accept: Callable[[np.ndarray], np.ndarray],
+    tries: int,
+    what: str,
+) -> np.ndarray:
+    """Returns the first of uniformly drawn points that is accepted.
+
+    Args:
+        rng: the only source of randomness.
+        half_widths: coordinate k is drawn within +-``half_widths[k]``, D of them.
+        accept: tells of points (N, D) which are accepted, (N,).
+        tries: how many are drawn at most.
+        what: what is looked for, for the message.
+
+    Returns:
+        The point, shape (D,).
 
     Raises:
-        PlacementError: after ``tries`` draws; the message says what was asked for.
+        PlacementError: if none of ``tries`` points is accepted.
     """
-    for _ in range(tries):
-        drawn = draw()
-        if drawn is not None:
-            return drawn
+    wide = np.asarray(half_widths)
+    for start in range(0, tries, _BATCH):
+        points = rng.uniform(-wide, wide, size=(min(_BATCH, tries - start), len(wide)))
+        accepted = np.flatnonzero(accept(points))
+        if len(accepted):
+            return points[accepted[0]]
     raise PlacementError(f"no place in {tries} tries for {what}")
 
 
