@@ -27,7 +27,7 @@ class ClutterGraspingExpert(Expert):
 
     _on_top = 0.027  # m: an object is not on top if the centre of a higher one is as near
     _deepest = 0.02  # m, the grasp is lowered by up to this
-    _clear = 0.09  # m, height from which the next object is approached
+    _clear = 0.07  # m, height from which the next object is approached
     _reach = 0.05  # m, horizontal distance from which it comes down
     _stuck = 0.004  # m: a move shorter than this was broken off
 
@@ -35,41 +35,35 @@ class ClutterGraspingExpert(Expert):
         """Forgets the last episode."""
         self._rng = rng
         self._attempt: _Attempt | None = None
-        self._failed: int | None = None
 
     def plan(self, scene: Scene, held: int | None) -> np.ndarray:
         """Returns the action for a state, shape (5,)."""
         if held is not None:
             return np.array([CLOSED, 0.0, 0.0, 1.0, 0.0])
-        if self._attempt is not None and self._attempt.closed:
-            self._failed, self._attempt = self._attempt.target, None
-        if self._attempt is None:
-            if self._failed is not None and scene.position[2] < self._clear:
-                return np.array([OPEN, 0.0, 0.0, 1.0, 0.0])
-            self._attempt = self._choose(scene)
+        if self._attempt is None or self._attempt.closed:
+            failed = None if self._attempt is None else self._attempt.target
+            self._attempt = self._choose(scene, failed)
         return self._approach(scene, self._attempt)
 
     def _approach(self, scene: Scene, attempt: _Attempt) -> np.ndarray:
-        blocked = attempt.last is not None and (
-            np.linalg.norm(scene.position - attempt.last) < self._stuck
-        )
-        attempt.last = scene.position
-        if blocked:  # something is in the way: grasp what is there
+        where = scene.objects[attempt.target, :3] - (0, 0, attempt.lowering)
+        above = np.hypot(*(where[:2] - scene.position[:2])) < self._reach
+        moved = np.inf if attempt.last is None else np.linalg.norm(scene.position - attempt.last)
+        first, attempt.last = attempt.last is None, scene.position
+        if moved < self._stuck:  # something is in the way: grasp what is there
             action = np.array([CLOSED, 0.0, 0.0, 0.0, 0.0])
-        else:
-            where = scene.objects[attempt.target, :3] - (0, 0, attempt.lowering)
-            above = np.hypot(*(where[:2] - scene.position[:2])) < self._reach
-            if not above:
-                where[2] = self._clear  # over the others
-            arrived = CLOSED if above else OPEN
-            action = self._toward(scene, where, attempt.yaw, gripper=OPEN, arrived=arrived)
+        elif above and not (first and scene.position[2] < self._clear):
+            action = self._toward(scene, where, attempt.yaw, gripper=OPEN, arrived=CLOSED)
+        else:  # over the others
+            where[2] = self._clear
+            action = self._toward(scene, where, attempt.yaw, gripper=OPEN, arrived=OPEN)
         attempt.closed = action[0] == CLOSED
         return action
 
-    def _choose(self, scene: Scene) -> _Attempt:
+    def _choose(self, scene: Scene, failed: int | None) -> _Attempt:
         """Draws the next attempt; another object than the last, if there is one on top."""
         candidates = self._topmost(scene)
-        others = [target for target in candidates if target != self._failed]
+        others = [target for target in candidates if target != failed]
         target = int(self._rng.choice(others or candidates))
         yaw = nearest_symmetric_yaw(self._draw_yaw(scene, target), scene.yaw, np.pi)
         return _Attempt(target, yaw, self._rng.uniform(0, self._deepest))

@@ -11,7 +11,7 @@ import numpy as np
 
 from equirl.envs.objects import Body, ObjectSet, bowl
 from equirl.envs.scene import Scene
-from equirl.envs.tasks.base import State, lying, rejection_sample
+from equirl.envs.tasks.base import State, lying
 from equirl.envs.tasks.block_task import BlockTask
 
 
@@ -64,20 +64,8 @@ class BlockInBowl(BlockTask):
 
     def sample(self, rng: np.random.Generator, home: Scene) -> Scene:
         """Draws the cube's x, y and yaw and the bowl's x and y."""
-
-        def draw() -> np.ndarray | None:
-            cube = self.sample_cube(rng)
-            x, y = rng.uniform(-self.bowl_half_width, self.bowl_half_width, size=2)
-            apart = np.hypot(*(cube[:2] - (x, y))) >= self.bowl_distance
-            return np.stack((cube, lying(self.bowl, x, y, 0.0))) if apart else None
-
-        objects = rejection_sample(
-            draw,
-            self.placement_tries,
-            f"a bowl within ±{self.bowl_half_width} m that is bowl_distance={self.bowl_distance} m "
-            f"from a cube within ±{self.start_half_width} m",
-        )
-        return replace(home, objects=objects)
+        cube, where = self.sample_apart(rng, self.bowl_half_width, self.bowl_distance, "a bowl")
+        return replace(home, objects=np.stack((cube, lying(self.bowl, *where, yaw=0.0))))
 
     def succeeded(self, state: State) -> bool:
         """Tells whether the cube lies in the upright bowl and, if asked for, is released."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from equirl.envs.objects import ObjectSet
 from equirl.envs.scene import Scene
-from equirl.envs.tasks.base import State
+from equirl.envs.tasks.base import State, lying
 from equirl.envs.tasks.block_task import BlockTask
 
 
@@ -34,7 +34,9 @@ class BlockPicking(BlockTask):
 
     def sample(self, rng: np.random.Generator, home: Scene) -> Scene:
         """Draws the cube's x, y and yaw."""
-        return replace(home, objects=self.sample_cube(rng)[None])
+        wide = np.array(self.start_range)
+        pose = lying(self.cube, *rng.uniform(-wide, wide))
+        return replace(home, objects=pose[None])
 
     def succeeded(self, state: State) -> bool:
         """Tells whether the cube is held high enough."""

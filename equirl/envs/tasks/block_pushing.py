@@ -9,7 +9,7 @@ import numpy as np
 
 from equirl.envs.objects import ObjectSet
 from equirl.envs.scene import Area, Scene
-from equirl.envs.tasks.base import State, rejection_sample
+from equirl.envs.tasks.base import State
 from equirl.envs.tasks.block_task import BlockTask
 
 
@@ -52,20 +52,8 @@ class BlockPushing(BlockTask):
 
     def sample(self, rng: np.random.Generator, home: Scene) -> Scene:
         """Draws the cube's x, y and yaw and the goal's x and y."""
-
-        def draw() -> np.ndarray | None:
-            pose = self.sample_cube(rng)
-            goal = rng.uniform(-self.goal_half_width, self.goal_half_width, size=2)
-            apart = np.hypot(*(pose[:2] - goal)) >= self.goal_distance
-            return np.concatenate((pose, goal)) if apart else None
-
-        drawn = rejection_sample(
-            draw,
-            self.placement_tries,
-            f"a goal within ±{self.goal_half_width} m that is goal_distance={self.goal_distance} m "
-            f"from a cube within ±{self.start_half_width} m",
-        )
-        return replace(home, objects=drawn[None, :7], areas=np.array([[*drawn[7:], 0.0]]))
+        cube, goal = self.sample_apart(rng, self.goal_half_width, self.goal_distance, "a goal")
+        return replace(home, objects=cube[None], areas=np.array([[*goal, 0.0]]))
 
     def succeeded(self, state: State) -> bool:
         """Tells whether the cube lies in the goal area and is not held."""

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from equirl.envs.objects import Body, cube
-from equirl.envs.tasks.base import Task, lying
+from equirl.envs.tasks.base import Task, lying, rejection_sample
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +37,34 @@ class BlockTask(Task):
         """The cube."""
         return cube(self.cube_side, self.cube_mass, self.cube_friction)
 
-    def sample_cube(self, rng: np.random.Generator) -> np.ndarray:
-        """Draws the cube's pose, shape (7,)."""
-        x, y = rng.uniform(-self.start_half_width, self.start_half_width, size=2)
-        return lying(self.cube, x, y, rng.uniform(-self.start_yaw, self.start_yaw))
+    @property
+    def start_range(self) -> tuple[float, float, float]:
+        """Half widths of the ranges of the cube's x, y (m) and yaw (rad)."""
+        return (self.start_half_width, self.start_half_width, self.start_yaw)
+
+    def sample_apart(
+        self, rng: np.random.Generator, half_width: float, distance: float, what: str
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Draws the cube's pose and a point at a distance from it.
+
+        Args:
+            rng: the only source of randomness.
+            half_width: the point is drawn within +-this, m.
+            distance: the least distance of cube and point, m.
+            what: what the point is, for the message.
+
+        Returns:
+            The cube's pose, shape (7,), and the point's x and y, shape (2,), m.
+
+        Raises:
+            PlacementError: if they do not fit.
+        """
+        drawn = rejection_sample(
+            rng,
+            (*self.start_range, half_width, half_width),
+            lambda points: np.hypot(*(points[:, :2] - points[:, 3:]).T) >= distance,
+            self.placement_tries,
+            f"{what} within ±{half_width} m, at least {distance} m from a cube within "
+            f"±{self.start_half_width} m",
+        )
+        return lying(self.cube, *drawn[:3]), drawn[3:]

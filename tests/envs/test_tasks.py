@@ -1,0 +1,296 @@
+"""The four tasks: where things start, what success is, what goes on to the next episode."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torchrl.envs.utils import check_env_specs
+
+from equirl.envs import PlacementError, Scene, make_env
+from equirl.envs.objects import Body, ConvexPolyhedron, ObjectSet
+from equirl.envs.tasks import (
+    TASKS,
+    BlockInBowl,
+    BlockPushing,
+    ClutterGrasping,
+    State,
+    make_task,
+)
+
+HOME = Scene([0, 0, 0.2], 0.0, 0.08, [])
+REST = (0, 0, 0, 1)
+
+
+def state(task, objects, *, z=0.2, held=None, touching=False, areas=()) -> State:
+    scene = Scene([0, 0, z], 0.0, 0.08, objects, areas=areas).named(task.bodies)
+    return State(scene, held, lambda first, second: touching)
+
+
+def samples(task, count: int = 200) -> list[Scene]:
+    return [task.sample(np.random.default_rng(seed), HOME) for seed in range(count)]
+
+
+def bricks(count: int = 1) -> ObjectSet:
+    brick = ConvexPolyhedron.box([0.035, 0.025, 0.02])
+    return ObjectSet([Body((brick,), 0.15, 0.6, name=f"brick{k}") for k in range(count)], "bricks")
+
+
+@pytest.fixture
+def clutter():
+    env = make_env("clutter_grasping", image_size=16, robot="hand", objects=bricks(3))
+    yield env
+    env.close()
+
+
+def act(env, td, *action):
+    td = td.clone().set("action", torch.tensor(action, dtype=torch.float32))
+    return env.step(td)["next"]
+
+
+def grasp(env) -> torch.Tensor:
+    """Puts the gripper around an object and lifts it; returns the reward."""
+    scene = env.get_scene()
+    pose = scene.objects[0]
+    yaw = 2 * np.arctan2(pose[5], pose[6]) + np.pi / 2
+    seed, episodes = env._scene_seed, env._scene_episodes
+    td = env.set_scene(replace(scene, position=pose[:3], yaw=yaw))
+    env._scene_seed, env._scene_episodes = seed, episodes  # the stream's episode goes on
+    td = act(env, td, -1, 0, 0, 0, 0)
+    while not td["done"]:
+        td = act(env, td, -1, 0, 0, 1, 0)
+    return td["reward"]
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_task_is_a_torchrl_environment(task):
+    env = make_env(task, image_size=16, robot="hand")
+    check_env_specs(env)
+    rollout = env.rollout(4)
+    assert rollout["depth"].min() >= 0 and rollout["depth"].max() <= np.float32(0.32)
+    env.close()
+
+
+def test_pushing_starts_with_the_goal_apart_from_the_cube():
+    task = BlockPushing()
+    for scene in samples(task):
+        (cube,), (goal,) = scene.objects, scene.areas
+        assert np.abs(cube[:2]).max() <= 0.09 and np.abs(goal[:2]).max() <= 0.085
+        assert np.hypot(*(cube[:2] - goal[:2])) >= 0.09
+        assert cube[2] == 0.025 and goal[2] == 0
+    assert (task.view, task.margin, task.areas[0].side, task.areas[0].raise_by) == (
+        0.45,
+        0.05,
+        0.09,
+        0.02,
+    )
+
+
+@pytest.mark.parametrize(
+    ("x", "z", "held", "success"),
+    [
+        (0.149, 0.025, None, True),
+        (0.151, 0.025, None, False),  # too far
+        (0.100, 0.031, None, False),  # not on the ground
+        (0.100, 0.025, 0, False),  # still held
+    ],
+)
+def test_success_of_pushing(x, z, held, success):
+    goal = [[0.1, 0.0, 0.0]]
+    assert (
+        BlockPushing().succeeded(state(BlockPushing(), [[x, 0, z, *REST]], held=held, areas=goal))
+        is success
+    )
+
+
+def test_bowl_and_cube_start_apart():
+    task = BlockInBowl()
+    for scene in samples(task):
+        cube, bowl = scene.objects
+        assert np.abs(cube[:2]).max() <= 0.09 and np.abs(bowl[:2]).max() <= 0.065
+        assert np.hypot(*(cube[:2] - bowl[:2])) >= 0.17
+        assert scene.names == () and len(task.bodies) == 2
+
+
+TILTED = (np.sin(0.2), 0, 0, np.cos(0.2))  # by 0.4 rad, more than pi / 9
+
+
+@pytest.mark.parametrize(
+    ("x", "orientation", "held", "touching", "released_only", "success"),
+    [
+        (0.029, REST, None, True, True, True),
+        (0.031, REST, None, True, True, False),
+        (0.0, TILTED, None, True, True, False),
+        (0.0, REST, None, False, True, False),
+        (0.0, REST, 0, True, True, False),
+        (0.0, REST, 0, True, False, True),
+    ],
+)
+def test_success_of_block_in_bowl(x, orientation, held, touching, released_only, success):
+    task = BlockInBowl(require_release=released_only)
+    objects = [[x, 0, 0.04, *REST], [0, 0, 0.034, *orientation]]
+    assert task.succeeded(state(task, objects, held=held, touching=touching)) is success
+
+
+def test_the_papers_options_do_not_ask_for_release():
+    assert BlockInBowl.paper_options == {"require_release": False}
+
+
+def test_clutter_draws_kinds_sizes_and_places():
+    task = ClutterGrasping(objects=bricks(4))
+    scenes = samples(task, 50)
+    names = {name for scene in scenes for name in scene.names}
+    scales = np.array([scene.scales for scene in scenes])
+    assert names == set(task.bodies) and len(scenes[0].names) == 5
+    assert 0.8 <= scales.min() < 0.82 and 0.98 < scales.max() <= 1.0
+    poses = np.stack([scene.objects for scene in scenes])
+    assert (poses[..., 2] == 0.20).all() and np.abs(poses[..., :2]).max() <= 0.10
+    yaws = 2 * np.arctan2(poses[..., 5], poses[..., 6])
+    assert np.abs(yaws).max() <= np.pi / 4
+
+
+def test_a_heap_has_come_to_rest_within_the_bin(clutter):
+    for seed in range(6):
+        clutter.set_seed(seed)
+        clutter.reset()
+        start = clutter.get_scene()
+        assert len(start.objects) == 5
+        assert all(clutter.workspace.contains(pose[:3], margin=0.05) for pose in start.objects)
+        act(clutter, clutter.reset(), 1, 0, 0, 0, 0)
+        moved = clutter.get_scene().objects[:, :3] - start.objects[:, :3]
+        assert np.median(np.linalg.norm(moved, axis=1)) < 5e-3
+
+
+def test_a_grasped_object_is_gone_in_the_next_episode(clutter):
+    clutter.reset()
+    for left in (4, 3, 2):
+        before = clutter.get_scene()
+        assert grasp(clutter) == 1
+        assert clutter.scene_continues
+        clutter.reset()
+        after = clutter.get_scene()
+        assert len(after.objects) == left and after.names == before.names[1:]
+        np.testing.assert_allclose(after.position, (0, 0, 0.2), atol=1e-6)
+        assert after.aperture == pytest.approx(0.08) and clutter.held_object() is None
+
+
+def test_a_new_scene_comes_when_all_are_gone_or_after_seven_episodes_or_when_one_is_lost():
+    env = make_env("clutter_grasping", image_size=8, robot="hand", objects=bricks(), object_count=1)
+    env.reset()
+    assert grasp(env) == 1 and not env.scene_continues  # all gone
+    env.reset()
+    for episode in range(6):
+        assert env.scene_continues, episode
+        scene = env.get_scene()
+        env.reset()
+        np.testing.assert_allclose(env.get_scene().objects, scene.objects, atol=2e-3)
+    assert not env.scene_continues  # the seventh has begun
+    env.reset()
+    lost = replace(env.get_scene(), objects=np.array([[0.26, 0, 0.03, *REST]]))
+    env._simulation.place(lost)
+    td = act(env, env.fake_tensordict().exclude("next"), 1, 0, 0, 0, 0)
+    assert td["terminated"] and td["reward"] == 0 and not env.scene_continues
+    env.close()
+
+
+def test_a_scene_may_go_on_for_ever():
+    task = ClutterGrasping(objects=bricks(), object_count=1, max_scene_episodes=0)
+    end = state(task, [[0, 0, 0.02, *REST]])
+    assert task.continued(end, False, 10_000) is end.scene
+    assert ClutterGrasping(objects=bricks()).continued(end, False, 7) is None
+
+
+def test_an_object_in_the_air_at_the_end_of_an_episode_falls_before_the_next(clutter):
+    clutter.reset()
+    scene = clutter.get_scene()
+    seed, episodes = clutter._scene_seed, clutter._scene_episodes
+    pose = scene.objects[0].copy()
+    pose[2] += 0.10
+    clutter.set_scene(replace(scene, objects=np.vstack((pose[None], scene.objects[1:]))))
+    clutter._scene_seed, clutter._scene_episodes = seed, episodes
+    clutter.reset()
+    assert clutter.get_scene().objects[0, 2] < pose[2] - 0.05
+
+
+def test_setting_a_scene_ends_the_one_that_goes_on(clutter):
+    clutter.reset()
+    clutter.set_scene(clutter.get_scene())
+    assert not clutter.scene_continues
+
+
+def test_every_number_can_be_set():
+    env = make_env("block_pushing", image_size=16, robot="hand", goal_side=0.2, view=0.3)
+    assert env.task.areas[0].side == 0.2 and env.task.view == 0.3
+    env.close()
+    assert make_task("block_in_bowl", bowl_width=0.2).bowl.extents[0] == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        (
+            "block_picking",
+            {"lift": 0.1},
+            "block_picking has no option lift; its options: .*lift_hei",
+        ),
+        ("block_picking", {"cube_side": 0}, "cube_side must be a finite number above 0, got 0"),
+        ("block_picking", {"view": float("nan")}, "view must be .* got nan"),
+        ("block_picking", {"lift_height": "high"}, "lift_height must be .* got 'high'"),
+        ("block_pushing", {"goal_raise": -1}, "goal_raise must be .* 0 or more, got -1"),
+        ("block_in_bowl", {"require_release": "no"}, "require_release must be True or False"),
+        ("block_in_bowl", {"bowl_width": 0.05}, "bowl_width must be .*got 0.05"),
+        ("clutter_grasping", {"object_count": 0}, "object_count must be an integer above 0, got 0"),
+        ("clutter_grasping", {"object_count": 2.5}, "object_count must be an integer .* got 2.5"),
+        ("clutter_grasping", {"largest_scale": 0.5}, "at least smallest_scale=0.8, got 0.5"),
+        ("clutter_grasping", {"names": "mug"}, "names must be a list of names, got 'mug'"),
+        (
+            "clutter_grasping",
+            {"objects": bricks(2), "names": ["brik1"]},
+            "unknown object 'brik1' in bricks, which has 2, for example brick1",
+        ),
+    ],
+)
+def test_impossible_numbers_are_named(name, options, message):
+    with pytest.raises(ValueError, match=message):
+        make_task(name, **options)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        (
+            "block_pushing",
+            {"goal_distance": 0.5},
+            "no place in 20000 tries for a goal .* 0.5 m from",
+        ),
+        (
+            "block_in_bowl",
+            {"bowl_distance": 0.4},
+            "no place in 20000 tries for a bowl .* 0.4 m from",
+        ),
+        (
+            "clutter_grasping",
+            {"objects": bricks(), "start_half_width": 0.4, "placement_tries": 3},
+            "no scene in 3 tries: each time an object came to rest",
+        ),
+    ],
+)
+def test_impossible_scenes_end_with_the_number_of_tries_and_the_reason(name, options, message):
+    env = make_env(name, image_size=8, robot="hand", **options)
+    with pytest.raises(PlacementError, match=message):
+        env.reset()
+    env.close()
+
+
+def test_scenes_of_other_tasks_are_refused():
+    env = make_env("block_pushing", image_size=8, robot="hand")
+    cube = [[0, 0, 0.025, *REST]]
+    with pytest.raises(ValueError, match="the scene has 0 areas, the task has 1"):
+        env.set_scene(Scene([0, 0, 0.2], 0.0, 0.08, cube))
+    with pytest.raises(ValueError, match="unknown object 'mug'"):
+        env.set_scene(Scene([0, 0, 0.2], 0.0, 0.08, cube, names=["mug"], areas=[[0, 0, 0]]))
+    with pytest.raises(RuntimeError, match="no scene yet; reset it first"):
+        env.get_scene()
+    env.close()
