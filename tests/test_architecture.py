@@ -32,6 +32,9 @@ CONFINED = {
     "hydra": "config.py",
     "wandb": "training/metrics.py",
     "imageio": "training/video.py",
+    "gymnasium": "envs/gymnasium.py",
+    "trimesh": "envs/objects/mesh_folder.py",
+    "coacd": "envs/objects/mesh_folder.py",
     "tqdm": "training/loop.py",
 }
 
