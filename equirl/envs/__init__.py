@@ -3,7 +3,16 @@
 from equirl.envs.experts import make_expert
 from equirl.envs.factory import make_env
 from equirl.envs.manipulation import ManipulationEnv
+from equirl.envs.parallel import WorkerError, make_parallel_env
 from equirl.envs.scene import Scene
 from equirl.envs.tasks import PlacementError
 
-__all__ = ["ManipulationEnv", "PlacementError", "Scene", "make_env", "make_expert"]
+__all__ = [
+    "ManipulationEnv",
+    "PlacementError",
+    "Scene",
+    "WorkerError",
+    "make_env",
+    "make_expert",
+    "make_parallel_env",
+]
