@@ -142,7 +142,7 @@ class ManipulationEnv(EnvBase):
             scene = task.sample(rng, home).named(task.bodies)
             if not task.drops_objects:
                 return scene
-            scene = self._connected().dropped(scene)
+            scene = self._connected().settled(scene, one_by_one=True)
             if not self._lost_object(scene, None):
                 return scene
         raise PlacementError(

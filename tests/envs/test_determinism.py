@@ -11,22 +11,26 @@ import pytest
 import torch
 
 from equirl.envs import make_env, make_expert
+from equirl.envs.bullet import simulation
+from equirl.envs.tasks import TASKS
 
 
-def digest(env, seed: int) -> str:
-    """Hashes an episode: the expert's grasp and lift, then random moves with the cube."""
+def digest(env, seed: int, episodes: int = 1) -> str:
+    """Hashes episodes: the expert's until they end, then random moves, 12 steps each."""
     env.set_seed(seed)
-    expert, rng, td = make_expert(env), np.random.default_rng(seed), env.reset()
-    bits = hashlib.sha256()
-    for step in range(11):
-        td = td.clone()
-        if step < 7:
-            expert(td)
-        else:
-            td["action"] = torch.tensor(rng.uniform(-1, 1, 5), dtype=torch.float32)
-        td = env.step(td)["next"]
-        bits.update(td["depth"].numpy().tobytes())
-        bits.update(env.get_scene().objects.tobytes())
+    expert, rng, bits = make_expert(env), np.random.default_rng(seed), hashlib.sha256()
+    for _ in range(episodes):
+        td, expert_acts = env.reset(), True
+        for _ in range(12):
+            td = td.clone()
+            if expert_acts:
+                expert(td)
+            else:
+                td["action"] = torch.tensor(rng.uniform(-1, 1, 5), dtype=torch.float32)
+            td = env.step(td)["next"]
+            expert_acts = expert_acts and not td["done"].item()
+            bits.update(td["depth"].numpy().tobytes())
+            bits.update(env.get_scene().objects.tobytes())
     return bits.hexdigest()
 
 
@@ -41,23 +45,43 @@ def disturb(env, rng: np.random.Generator) -> None:
         td = env.step(td)["next"]
 
 
-@pytest.mark.parametrize("robot", ["panda", "hand"])
-def test_an_episode_does_not_depend_on_what_came_before_it(robot):
-    first, second = (make_env("block_picking", image_size=16, robot=robot) for _ in range(2))
-    expected = [digest(first, seed) for seed in range(3)]
-    assert len(set(expected)) == 3
+def check_independence(task: str, robot: str, rounds: int) -> None:
+    first, second = (make_env(task, image_size=16, robot=robot) for _ in range(2))
+    expected = [digest(first, seed, episodes=2) for seed in range(2)]
+    assert expected[0] != expected[1]
     rng = np.random.default_rng(0)
-    for _ in range(25):
+    for _ in range(rounds):
         env = (first, second)[rng.integers(2)]
         disturb(env, rng)
-        seed = int(rng.integers(3))
-        assert digest(env, seed) == expected[seed]
+        seed = int(rng.integers(2))
+        assert digest(env, seed, episodes=2) == expected[seed]
     first.close()
     second.close()
 
 
-def test_interleaved_environments_do_not_disturb_each_other():
-    envs = [make_env("block_picking", image_size=16, seed=7, robot="hand") for _ in range(3)]
+@pytest.mark.parametrize("task", TASKS)
+def test_an_episode_does_not_depend_on_what_came_before_it(task):
+    check_independence(task, "panda", 8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", ["panda", "hand"])
+@pytest.mark.parametrize("task", TASKS)
+def test_no_episode_of_many_depends_on_what_came_before_it(task, robot):
+    check_independence(task, robot, 40)
+
+
+def test_connecting_anew_changes_nothing(monkeypatch):
+    env = make_env("clutter_grasping", image_size=16, robot="hand")
+    expected = digest(env, 0, episodes=3)
+    monkeypatch.setattr(simulation, "_WORLDS_A_CONNECTION", 2)
+    assert digest(env, 0, episodes=3) == expected
+    env.close()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_eight_interleaved_environments_do_not_disturb_each_other(task):
+    envs = [make_env(task, image_size=16, seed=7, robot="hand") for _ in range(8)]
     states = [env.reset() for env in envs]
     rng = np.random.default_rng(0)
     for _ in range(6):
@@ -66,9 +90,29 @@ def test_interleaved_environments_do_not_disturb_each_other():
             env.step(td.clone().set("action", action))["next"]
             for env, td in zip(envs, states, strict=True)
         ]
+        scenes = [env.get_scene() for env in envs]
         assert all(torch.equal(td["depth"], states[0]["depth"]) for td in states)
+        assert all(scene == scenes[0] for scene in scenes)
     for env in envs:
         env.close()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_restored_scene_plays_on_alike_in_any_environment(task):
+    first, second = (make_env(task, image_size=16, robot="hand") for _ in range(2))
+    first.reset()
+    scene = first.get_scene()
+    disturb(second, np.random.default_rng(1))
+    depths = []
+    for env in (first, second, second):
+        td, rng = env.set_scene(scene), np.random.default_rng(0)
+        for _ in range(6):
+            action = torch.tensor(rng.uniform(-1, 1, 5), dtype=torch.float32)
+            td = env.step(td.clone().set("action", action))["next"]
+        depths.append(td["depth"])
+    assert torch.equal(depths[0], depths[1]) and torch.equal(depths[1], depths[2])
+    first.close()
+    second.close()
 
 
 def test_episodes_after_the_first_follow_from_the_seed_too():
@@ -103,14 +147,17 @@ def test_no_global_generator_is_used():
 
 
 def test_another_process_gives_the_same_bits():
-    env = make_env("block_picking", image_size=16)
-    here = digest(env, 2)
-    env.close()
+    here = {}
+    for task in TASKS:
+        env = make_env(task, image_size=16)
+        here[task] = digest(env, 2, episodes=2)
+        env.close()
     code = (
         "import importlib.util as u; from equirl.envs import make_env;"
         f"s = u.spec_from_file_location('d', {__file__!r}); m = u.module_from_spec(s);"
         "s.loader.exec_module(m);"
-        "print('digest', m.digest(make_env('block_picking', image_size=16), 2))"
+        f"[print(t, m.digest(make_env(t, image_size=16), 2, episodes=2)) for t in {list(TASKS)!r}]"
     )
     out = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
-    assert f"digest {here}" in out.stdout
+    for task, value in here.items():
+        assert f"{task} {value}" in out.stdout

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from equirl.envs.bullet.client import Client
+from equirl.envs.bullet.floor import Floor, View
 from equirl.envs.bullet.loading import load_picture
-from equirl.envs.bullet.models import load_robot, robot_model
-from equirl.envs.objects import ObjectSet
+from equirl.envs.bullet.models import RobotLoader, robot_model
+from equirl.envs.objects import Body, ConvexPolyhedron, ObjectSet
+from equirl.envs.objects.bodies import Color
 from equirl.envs.scene import Area, Scene
 from equirl.envs.workspace import Workspace
 
-_TABLE_COLOR = (0.93, 0.93, 0.91, 1.0)
-_WALL_COLOR = (0.55, 0.65, 0.75, 1.0)
-_AREA_COLOR = (0.35, 0.75, 0.45, 1.0)
+_WALL_COLOR: Color = (0.55, 0.65, 0.75, 1.0)
+_FINGER_COLOR: Color = (0.25, 0.26, 0.30, 1.0)
+_WALL_THICKNESS = 0.008  # m
+_CELL = View(eye=(0.56, -0.52, 0.82), target=(-0.06, 0.01, 0.13), angle=43.0)
 
 
 class Camera:
@@ -24,19 +29,32 @@ class Camera:
     Args:
         bodies: as for `Simulation`.
         areas: the squares that the task marks, in the order of `Scene.areas`.
-        robot: as for `Simulation`.
+        robot: as for `Simulation`; None: neither robot nor walls are shown.
         workspace: as for `Simulation`.
+        view: where pictures are taken from.
     """
 
     def __init__(
-        self, bodies: ObjectSet, areas: tuple[Area, ...], robot: str, workspace: Workspace
+        self,
+        bodies: ObjectSet,
+        areas: tuple[Area, ...],
+        robot: str | None,
+        workspace: Workspace,
+        view: View = _CELL,
     ):
         self._bodies = bodies
-        self._client = client = Client()
-        self._robot = load_robot(client, robot_model(robot, workspace), visual=True)
-        self._add_bin(workspace)
-        self._areas = [self._add_area(area) for area in areas]
+        self._client = Client()
+        self._floor = Floor(areas, workspace)
+        self._background = lru_cache(maxsize=2)(self._floor.background)
         self._shown: dict[tuple[int, str, float], int] = {}
+        self._view = view
+        self._robot: int | None = None
+        if robot is not None:
+            loader = RobotLoader(self._client, robot_model(robot, workspace), visual=True)
+            self._robot = loader.load()
+            loader.close()
+            self._color_fingers(self._robot)
+            self._add_walls(workspace)
 
     def close(self) -> None:
         """Disconnects; harmless when done before."""
@@ -55,50 +73,51 @@ class Camera:
             Red, green, blue, shape (height, width, 3), uint8.
         """
         client = self._client
-        for index, value in enumerate(joints):
-            client.resetJointState(self._robot, index, value)
-        for body, (x, y, yaw) in zip(self._areas, scene.areas.tolist(), strict=True):
-            turn = (0, 0, np.sin(yaw / 2), np.cos(yaw / 2))
-            client.resetBasePositionAndOrientation(body, (x, y, 5e-4), turn)
+        if self._robot is not None:
+            for index, value in enumerate(joints):
+                client.resetJointState(self._robot, index, value)
         for body, pose in zip(self._show(scene), scene.objects, strict=True):
             client.resetBasePositionAndOrientation(body, pose[:3].tolist(), pose[3:].tolist())
-        view = client.computeViewMatrix((0.85, -0.85, 0.75), (-0.14, 0.0, 0.22), (0, 0, 1))
-        projection = client.computeProjectionMatrixFOV(45, width / height, 0.05, 5.0)
-        pixels = client.getCameraImage(
+        fine = (2 * width, 2 * height)  # and then averaged: edges are not ragged
+        pixels, empty = self._render(*fine)
+        texture = self._floor.texture(scene, self._bodies, hand=self._robot is not None)
+        floor = self._background(self._view, *fine).colors(texture)
+        np.copyto(pixels, floor, where=empty[..., None])
+        return _halved(pixels)
+
+    def _render(self, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+        """Returns colours (height, width, 3) and which pixels show no mesh (height, width)."""
+        client, view = self._client, self._view
+        turned = client.computeViewMatrix(view.eye, view.target, (0, 0, 1))
+        projection = client.computeProjectionMatrixFOV(view.angle, width / height, 0.05, 5.0)
+        _, _, pixels, depth, _ = client.getCameraImage(
             width,
             height,
-            view,
+            turned,
             projection,
             lightDirection=(0.6, -0.4, 1.2),
             renderer=client.ER_TINY_RENDERER,
             flags=client.ER_NO_SEGMENTATION_MASK,
-        )[2]
-        return np.asarray(pixels, np.uint8).reshape(height, width, 4)[..., :3].copy()
+        )
+        colors = np.asarray(pixels, np.uint8).reshape(height, width, 4)[..., :3].copy()
+        return colors, np.asarray(depth).reshape(height, width) >= 1.0
 
-    def _add_bin(self, workspace: Workspace) -> None:
-        client, bin_ = self._client, workspace.bin
-        table = client.createVisualShape(
-            client.GEOM_BOX, halfExtents=(0.8, 0.6, 0.01), rgbaColor=_TABLE_COLOR
-        )
-        client.createMultiBody(0, baseVisualShapeIndex=table, basePosition=(-0.2, 0, -0.011))
-        inner, rim, top = bin_.floor_half_width, bin_.rim_half_width, bin_.rim_height
-        corners = [(inner, -inner, 0), (inner, inner, 0), (rim, rim, top), (rim, -rim, top)]
-        wall = client.createVisualShape(
-            client.GEOM_MESH,
-            vertices=corners,
-            indices=[0, 1, 2, 0, 2, 3, 2, 1, 0, 3, 2, 0],  # seen from both sides
-            rgbaColor=_WALL_COLOR,
-        )
+    def _color_fingers(self, robot: int) -> None:
+        for index in range(self._client.getNumJoints(robot)):
+            link = self._client.getJointInfo(robot, index)[12].decode()
+            if link.endswith("finger"):
+                self._client.changeVisualShape(robot, index, rgbaColor=_FINGER_COLOR)
+
+    def _add_walls(self, workspace: Workspace) -> None:
+        bin_, thick = workspace.bin, _WALL_THICKNESS
+        ends = [(bin_.floor_half_width, 0.0), (bin_.rim_half_width, bin_.rim_height)]
+        section = [*ends, *((x + thick, z) for x, z in ends)]
+        corners = np.array([(x, y, z) for x, z in section for y in (-x, x)])
+        wall = Body((ConvexPolyhedron.hull(corners),), mass=0, friction=0, color=_WALL_COLOR)
         for quarter in range(4):
             turn = (0, 0, np.sin(quarter * np.pi / 4), np.cos(quarter * np.pi / 4))
-            client.createMultiBody(0, baseVisualShapeIndex=wall, baseOrientation=turn)
-
-    def _add_area(self, area: Area) -> int:
-        half = area.side / 2
-        shape = self._client.createVisualShape(
-            self._client.GEOM_BOX, halfExtents=(half, half, 4e-4), rgbaColor=_AREA_COLOR
-        )
-        return self._client.createMultiBody(0, baseVisualShapeIndex=shape)
+            body = load_picture(self._client, wall)
+            self._client.resetBasePositionAndOrientation(body, (0, 0, 0), turn)
 
     def _show(self, scene: Scene) -> list[int]:
         """Makes the pictures of a scene's objects, unless they are there; returns their ids."""
@@ -110,3 +129,10 @@ class Camera:
                 _, name, scale = key
                 self._shown[key] = load_picture(self._client, self._bodies[name].scaled(scale))
         return [self._shown[key] for key in keys]
+
+
+def _halved(pixels: np.ndarray) -> np.ndarray:
+    """Returns the means of squares of four pixels: (2 H, 2 W, 3) to (H, W, 3), uint8."""
+    wide = pixels.astype(np.uint16)
+    rows = wide[::2] + wide[1::2]
+    return ((rows[:, ::2] + rows[:, 1::2] + 2) // 4).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Bodies into PyBullet: one collision shape, or one picture, a body."""
+"""Bodies into PyBullet: to collide, or to be seen."""
 
 from __future__ import annotations
 
@@ -8,52 +8,81 @@ from pathlib import Path
 import numpy as np
 
 from equirl.envs.bullet.client import Client
-from equirl.envs.objects import Body, ConvexPolyhedron
+from equirl.envs.objects import Body, ConvexPolyhedron, ObjectSet
 
 
-def load_collision_shape(client: Client, body: Body) -> int:
-    """Returns the id of a collision shape: a box, a convex hull or a compound of hulls."""
-    first = body.pieces[0]
-    if len(body.pieces) == 1:
-        if first.half_extents is not None:
-            half = first.half_extents.tolist()
-            return client.createCollisionShape(client.GEOM_BOX, halfExtents=half)
-        return client.createCollisionShape(client.GEOM_MESH, vertices=first.vertices.tolist())
-    with tempfile.TemporaryDirectory() as folder:
-        # PyBullet makes a convex hull of each object of a file; a list of hulls it does not take.
-        path = Path(folder) / "body.obj"
-        path.write_text(_wavefront(body.pieces))
-        return client.createCollisionShape(client.GEOM_MESH, fileName=str(path))
-
-
-def load_placeholder(client: Client) -> int:
-    """Returns the id of a visual shape that stands for a body's in a world without pictures.
-
-    A body without one would read the file of its collision shape again, and draw it.
-    """
-    return client.createVisualShape(client.GEOM_BOX, halfExtents=(1e-3, 1e-3, 1e-3))
-
-
-def load_body(client: Client, body: Body, shape: int, placeholder: int) -> int:
-    """Returns the id of a new body.
+class BodyLoader:
+    """Makes bodies in a world; keeps what it writes for that until it is closed.
 
     Args:
         client: where to.
-        body: its mass, inertia and friction.
-        shape: what `load_collision_shape` returned for it.
-        placeholder: what `load_placeholder` returned.
+        bodies: the bodies, by name.
     """
-    loaded = client.createMultiBody(body.mass, shape, placeholder)
-    client.changeDynamics(
-        loaded,
-        -1,
-        lateralFriction=body.friction,
-        rollingFriction=body.rolling_friction,
-        spinningFriction=body.rolling_friction,
-        # PyBullet takes that of the bounding box.
-        localInertiaDiagonal=body.inertia.tolist(),
-    )
-    return loaded
+
+    def __init__(self, client: Client, bodies: ObjectSet):
+        self._client = client
+        self._bodies = bodies
+        self._folder = tempfile.TemporaryDirectory(prefix="equirl_")
+        self._placeholder = -1
+
+    def close(self) -> None:
+        """Removes the files; harmless when done before."""
+        self._folder.cleanup()
+
+    def begin_world(self) -> None:
+        """Prepares a world that has just been made."""
+        # A body without a visual shape would be drawn from its collision shape.
+        self._placeholder = self._client.createVisualShape(
+            self._client.GEOM_BOX, halfExtents=(1e-3, 1e-3, 1e-3)
+        )
+
+    def load(self, name: str, scale: float, pose: np.ndarray) -> int:
+        """Returns the id of a new body at rest.
+
+        Args:
+            name: which.
+            scale: its size relative to the body of that name; its mass is the same.
+            pose: (x, y, z, qx, qy, qz, qw), m, shape (7,).
+        """
+        client, body = self._client, self._bodies[name]
+        loaded = client.createMultiBody(
+            body.mass,
+            self._shape(body, scale),
+            self._placeholder,
+            basePosition=pose[:3].tolist(),
+            baseOrientation=pose[3:].tolist(),
+        )
+        client.changeDynamics(
+            loaded,
+            -1,
+            lateralFriction=body.friction,
+            rollingFriction=body.rolling_friction,
+            spinningFriction=body.rolling_friction,
+            # PyBullet takes that of the bounding box.
+            localInertiaDiagonal=(scale**2 * body.inertia).tolist(),
+        )
+        return loaded
+
+    def _shape(self, body: Body, scale: float) -> int:
+        """Returns the id of a collision shape: a box, a convex hull or a compound of hulls."""
+        client, first = self._client, body.pieces[0]
+        if len(body.pieces) > 1:
+            # PyBullet makes a convex hull of each object of a file; no list of hulls it takes.
+            return client.createCollisionShape(
+                client.GEOM_MESH, fileName=str(self._file(body)), meshScale=[scale] * 3
+            )
+        if first.half_extents is not None:
+            half = (scale * first.half_extents).tolist()
+            return client.createCollisionShape(client.GEOM_BOX, halfExtents=half)
+        corners = (scale * first.vertices).tolist()
+        return client.createCollisionShape(client.GEOM_MESH, vertices=corners)
+
+    def _file(self, body: Body) -> Path:
+        # Numbered: a user's mesh may have any name.
+        path = Path(self._folder.name) / f"{list(self._bodies).index(body.name)}.obj"
+        if not path.exists():
+            path.write_text(_wavefront(body.pieces))
+        return path
 
 
 def load_picture(client: Client, body: Body) -> int:

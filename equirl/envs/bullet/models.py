@@ -59,15 +59,38 @@ def robot_model(name: str, workspace: Workspace) -> RobotModel:
     raise ValueError(f"unknown robot {name!r}; known: 'panda', 'hand'")
 
 
-def load_robot(client: Client, model: RobotModel, visual: bool = False) -> int:
-    """Loads a robot and returns its body id.
+class RobotLoader:
+    """Loads a robot into worlds; its description is derived once.
 
     Args:
         client: where to.
-        model: which.
+        model: which robot.
         visual: keep the meshes that a picture needs; they make every picture of PyBullet slow and
             physics does not use them.
     """
+
+    def __init__(self, client: Client, model: RobotModel, visual: bool = False):
+        self.model = model
+        self._client = client
+        self._folder = tempfile.TemporaryDirectory(prefix="equirl_")
+        self._path = Path(self._folder.name) / "robot.urdf"
+        _describe(model, visual).write(self._path)
+
+    def close(self) -> None:
+        """Removes the description; harmless when done before."""
+        self._folder.cleanup()
+
+    def load(self) -> int:
+        """Returns the id of a new robot."""
+        return self._client.loadURDF(
+            str(self._path),
+            basePosition=(self.model.base_x, 0.0, 0.0),
+            useFixedBase=True,
+            flags=self._client.URDF_USE_INERTIA_FROM_FILE,
+        )
+
+
+def _describe(model: RobotModel, visual: bool) -> ElementTree.ElementTree:
     source = panda_urdf()
     root = ElementTree.parse(source).getroot()
     model.derive(root)
@@ -80,15 +103,7 @@ def load_robot(client: Client, model: RobotModel, visual: bool = False) -> int:
     for mesh in root.iter("mesh"):
         filename = mesh.attrib["filename"].replace("package://", f"{source.parent}/")
         mesh.set("filename", filename)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "robot.urdf"
-        ElementTree.ElementTree(root).write(path)
-        return client.loadURDF(
-            str(path),
-            basePosition=(model.base_x, 0.0, 0.0),
-            useFixedBase=True,
-            flags=client.URDF_USE_INERTIA_FROM_FILE,
-        )
+    return ElementTree.ElementTree(root)
 
 
 def _remove(element: ElementTree.Element, tag: str) -> None:

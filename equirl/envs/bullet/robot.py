@@ -7,13 +7,14 @@ from collections.abc import Callable
 import numpy as np
 
 from equirl.envs.bullet.client import Client
-from equirl.envs.bullet.models import RobotModel, load_robot
+from equirl.envs.bullet.models import RobotLoader
 
 ARM_FORCE = 240.0  # N or N m
 GRIPPER_FORCE = 10.0  # N, each finger
 FINGER_FRICTION = 1.0
 FINGER_SPEED = 0.2  # m/s
 MOVE_STEPS = 24  # simulation steps of one move: 0.2 s
+MIN_GRIP_STEPS = 4  # for the arm to come to rest where it was sent, too
 MAX_GRIP_STEPS = 40
 # Strong as it is, the arm would press a cube through the floor. When the contacts push harder than
 # this, it takes a little of the move back and tries again, a few times: what can give way does.
@@ -28,16 +29,16 @@ class Robot:
 
     Args:
         client: the simulation it is loaded into.
-        model: which robot.
+        loader: loads it, and knows which robot it is.
         time_step: length of a simulation step, s.
         max_aperture: aperture of the open gripper, m.
     """
 
-    def __init__(self, client: Client, model: RobotModel, time_step: float, max_aperture: float):
+    def __init__(self, client: Client, loader: RobotLoader, time_step: float, max_aperture: float):
         self._client = client
-        self._model = model
+        self._model = model = loader.model
         self._time_step = time_step
-        self.body = load_robot(client, model)
+        self.body = loader.load()
         index = {
             client.getJointInfo(self.body, i)[1].decode(): i
             for i in range(client.getNumJoints(self.body))
@@ -137,14 +138,15 @@ class Robot:
         """Drives the fingers to ``aperture`` (m) until they are there or are stopped."""
         self.drive_gripper(aperture)
         still = 0
-        for _ in range(MAX_GRIP_STEPS):
+        for count in range(MAX_GRIP_STEPS):
             states = self._client.getJointStates(self.body, self.fingers)
-            if abs(states[0][0] + states[1][0] - aperture) < 5e-4:
+            there = abs(states[0][0] + states[1][0] - aperture) < 5e-4
+            if there and count >= MIN_GRIP_STEPS:
                 return
             step()
             states = self._client.getJointStates(self.body, self.fingers)
             still = still + 1 if max(abs(s[1]) for s in states) < 2e-3 else 0
-            if still == 3:
+            if still >= 3 and count + 1 >= MIN_GRIP_STEPS:
                 return
 
     def drive_gripper(self, aperture: float) -> None:

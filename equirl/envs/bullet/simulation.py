@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from equirl.envs.bullet.client import Client
-from equirl.envs.bullet.loading import load_body, load_collision_shape, load_placeholder
-from equirl.envs.bullet.models import robot_model
+from equirl.envs.bullet.loading import BodyLoader
+from equirl.envs.bullet.models import RobotLoader, robot_model
 from equirl.envs.bullet.robot import Robot
 from equirl.envs.objects import ObjectSet
 from equirl.envs.scene import Scene
@@ -19,19 +19,21 @@ SOLVER_ITERATIONS = 20
 # Contact normals with a smaller vertical part count as lateral, distances below this as touching.
 _LATERAL_NORMAL = 0.2
 _TOUCHING = 5e-4
+_OPPOSED = -0.5  # greatest product of the normals of two fingers that squeeze
 # Objects are at rest when they move slower than this (m/s, rad/s) for so many steps.
 _REST_SPEED, _REST_SPIN, _REST_STEPS = 0.005, 0.1, 4
 _PATIENCE = 240  # steps after which objects count as settled although they move
 _OUT_OF_THE_WAY = (0.0, 0.0, 0.45)  # of falling objects: where the robot waits, m
-# PyBullet leaks a few kB for every body made and does not free shapes: connect anew after these.
-_MAX_LOADS = 250
+# A world made anew leaves some kB behind in PyBullet; a connection made anew does not.
+_WORLDS_A_CONNECTION = 100
 
 
 class Simulation:
     """A PyBullet world of its own; connects at once.
 
-    The same sequence of calls gives the same bits in every process, and `place` leaves no trace of
-    what went before it.
+    Each scene begins in a world made anew, so that it plays the same bits in every process and
+    whatever was simulated before: what Bullet remembers of earlier pairs and contacts changes the
+    order of its sums otherwise.
 
     Args:
         bodies: what scenes are made of, by name.
@@ -43,10 +45,18 @@ class Simulation:
         self._bodies = bodies
         self._model = robot_model(robot, workspace)
         self._workspace = workspace
-        self._connect()
+        self._client = Client()
+        self._loader = BodyLoader(self._client, bodies)
+        self._robot_loader = RobotLoader(self._client, self._model)
+        self._worlds = 0
+        self._make_world()
 
-    def _connect(self) -> None:
-        self._client = client = Client()
+    def _make_world(self) -> None:
+        client = self._client
+        self._worlds += 1
+        if self._worlds % _WORLDS_A_CONNECTION == 0:
+            client.reconnect()
+        client.resetSimulation()
         client.setGravity(0, 0, -9.81)
         client.setPhysicsEngineParameter(
             fixedTimeStep=TIME_STEP,
@@ -57,20 +67,24 @@ class Simulation:
             enableFileCaching=0,  # or a shape would be that of an earlier file of the same name
         )
         self._load_bin()
-        self._robot = Robot(client, self._model, TIME_STEP, self._workspace.max_aperture)
-        self._placeholder = load_placeholder(client)
-        self._shapes: dict[tuple[str, float], int] = {}
-        self._present: tuple[tuple[str, float], ...] = ()  # name and scale of each object
+        self._robot = Robot(client, self._robot_loader, TIME_STEP, self._workspace.max_aperture)
+        self._loader.begin_world()
+        self._present: list[tuple[str, float]] = []  # name and scale of each object
         self._ids: list[int] = []
-        self._loads = 0
         self._areas = np.zeros((0, 3))
+
+    def _add(self, name: str, scale: float, pose: np.ndarray) -> None:
+        self._ids.append(self._loader.load(name, scale, pose))
+        self._present.append((name, scale))
 
     def close(self) -> None:
         """Disconnects; harmless when done before."""
         self._client.close()
+        self._loader.close()
+        self._robot_loader.close()
 
     def place(self, scene: Scene) -> None:
-        """Puts everything at rest into ``scene``, forgetting all contacts of the past.
+        """Puts everything at rest into ``scene``, in a world made anew.
 
         Args:
             scene: a state of bodies of this simulation.
@@ -79,18 +93,11 @@ class Simulation:
             ValueError: if it has others.
         """
         scene = scene.named(self._bodies)
-        self._load(tuple(zip(scene.names, scene.scales, strict=True)))
-        # Cached contact points would otherwise warm-start the solver: part all bodies first.
-        client = self._client
-        for k, body in enumerate(self._ids):
-            client.resetBasePositionAndOrientation(body, (5.0, 2.0 * k, 5.0), (0, 0, 0, 1))
-            client.resetBaseVelocity(body, (0, 0, 0), (0, 0, 0))
+        self._make_world()
         self._robot.place(scene.position, scene.yaw, scene.aperture, scene.grip)
-        client.performCollisionDetection()
-        for body, pose in zip(self._ids, scene.objects, strict=True):
-            client.resetBasePositionAndOrientation(body, pose[:3].tolist(), pose[3:].tolist())
-            client.resetBaseVelocity(body, (0, 0, 0), (0, 0, 0))
-        client.performCollisionDetection()
+        for name, scale, pose in zip(scene.names, scene.scales, scene.objects, strict=True):
+            self._add(name, scale, pose)
+        self._client.performCollisionDetection()
         self._areas = scene.areas
 
     def scene(self) -> Scene:
@@ -108,31 +115,32 @@ class Simulation:
             areas=self._areas,
         )
 
-    def settled(self, scene: Scene) -> Scene:
-        """Returns ``scene`` with its objects come to rest, the robot out of their way."""
-        aside = np.array(_OUT_OF_THE_WAY)
-        self.place(replace(scene, position=aside, yaw=0.0, aperture=0.0, grip=0.0))
+    def settled(self, scene: Scene, *, one_by_one: bool = False) -> Scene:
+        """Returns ``scene`` with its objects come to rest, the robot out of their way.
+
+        Args:
+            scene: where the objects start; its gripper is kept.
+            one_by_one: let each fall when those before it lie still.
+        """
+        scene = scene.named(self._bodies)
+        self._make_world()
+        self._robot.place(np.array(_OUT_OF_THE_WAY), 0.0, 0.0, 0.0)
+        for name, scale, pose in zip(scene.names, scene.scales, scene.objects, strict=True):
+            self._add(name, scale, pose)
+            if one_by_one:
+                self._wait()
+        if not one_by_one:
+            self._wait()
+        return replace(scene, objects=self.scene().objects)
+
+    def _wait(self) -> None:
+        """Simulates until the objects lie still, or until patience ends."""
         still = 0
         for _ in range(_PATIENCE):
             self._client.stepSimulation()
             still = 0 if self._in_motion() else still + 1
             if still == _REST_STEPS:
-                break
-        return replace(scene, objects=self.scene().objects)
-
-    def dropped(self, scene: Scene) -> Scene:
-        """Returns ``scene`` after its objects have fallen, each when those before it lie still."""
-        scene = scene.named(self._bodies)
-        resting = scene.objects[:0]
-        for k, pose in enumerate(scene.objects):
-            falling = replace(
-                scene,
-                objects=np.concatenate((resting, pose[None])),
-                names=scene.names[: k + 1],
-                scales=scene.scales[: k + 1],
-            )
-            resting = self.settled(falling).objects
-        return replace(scene, objects=resting)
+                return
 
     def joint_values(self) -> np.ndarray:
         """Returns the values of all joints of the robot."""
@@ -156,7 +164,7 @@ class Simulation:
         """
         for k, body in enumerate(self._ids):
             left, right = (self._lateral_normals(body, finger) for finger in self._robot.fingers)
-            if any(a[0] * b[0] + a[1] * b[1] < 0 for a in left for b in right):
+            if any(np.dot(a, b) < _OPPOSED for a in left for b in right):
                 return k
         return None
 
@@ -177,27 +185,6 @@ class Simulation:
             if max(map(abs, linear)) > _REST_SPEED or max(map(abs, angular)) > _REST_SPIN:
                 return True
         return False
-
-    def _load(self, wanted: tuple[tuple[str, float], ...]) -> None:
-        """Makes the bodies of a scene, unless they are there."""
-        if wanted == self._present:
-            return
-        if self._loads + len(wanted) > _MAX_LOADS:
-            self._client.close()
-            self._connect()
-        for loaded in self._ids:
-            self._client.removeBody(loaded)
-        self._present, self._ids = (), []
-        bodies = {key: self._bodies[key[0]].scaled(key[1]) for key in wanted}
-        for key, body in bodies.items():
-            if key not in self._shapes:
-                self._shapes[key] = load_collision_shape(self._client, body)
-        self._ids = [
-            load_body(self._client, bodies[key], self._shapes[key], self._placeholder)
-            for key in wanted
-        ]
-        self._present = wanted
-        self._loads += len(wanted)
 
     def _load_bin(self) -> None:
         client, bin_ = self._client, self._workspace.bin

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -129,7 +130,7 @@ class Body:
         """Sides of the bounding box along the body's axes, shape (3,), m."""
         return np.ptp(self.vertices, axis=0)
 
-    @property
+    @cached_property
     def inertia(self) -> np.ndarray:
         """Moments of inertia about the body's axes, shape (3,), kg m^2."""
         volumes, _, seconds = zip(*(piece.moments() for piece in self.pieces), strict=True)
