@@ -1,5 +1,6 @@
 """The symmetry, stated once: groups, representations, and how every key transforms."""
 
+from .audit import EnvAudit, audit_env
 from .groups import Element, SymmetryGroup
 from .representations import Irrep, Representation, ScalarField
 from .spec import ACTION, ACTION_PAPER, SymmetrySpec, action_representation, manipulation_spec
@@ -8,11 +9,13 @@ __all__ = [
     "ACTION",
     "ACTION_PAPER",
     "Element",
+    "EnvAudit",
     "Irrep",
     "Representation",
     "ScalarField",
     "SymmetryGroup",
     "SymmetrySpec",
     "action_representation",
+    "audit_env",
     "manipulation_spec",
 ]
