@@ -126,9 +126,10 @@ class TrainingRun:
         if self.config.demos.episodes == 0:
             return
         clip: Literal["box", "norm"] = "box" if self.config.mode == "paper" else "norm"
+        grasp = cast(Literal["random", "aligned"], self.config.demos.grasp)
         demonstrations = DemonstrationCollector(
             self.env,
-            make_expert(self.env, horizontal_clip=clip),
+            make_expert(self.env, horizontal_clip=clip, grasp=grasp),
             episodes=self.config.demos.episodes,
             seeds=partial(scene_seed, self.config.seed, Purpose.DEMONSTRATIONS),
             replay_buffer=self.buffer,

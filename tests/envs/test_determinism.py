@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from equirl.envs import make_env, make_expert
-from equirl.envs.bullet import simulation
 from equirl.envs.tasks import TASKS
 
 
@@ -69,14 +68,6 @@ def test_an_episode_does_not_depend_on_what_came_before_it(task):
 @pytest.mark.parametrize("task", TASKS)
 def test_no_episode_of_many_depends_on_what_came_before_it(task, robot):
     check_independence(task, robot, 40)
-
-
-def test_connecting_anew_changes_nothing(monkeypatch):
-    env = make_env("clutter_grasping", image_size=16, robot="hand")
-    expected = digest(env, 0, episodes=3)
-    monkeypatch.setattr(simulation, "_WORLDS_A_CONNECTION", 2)
-    assert digest(env, 0, episodes=3) == expected
-    env.close()
 
 
 @pytest.mark.parametrize("task", TASKS)

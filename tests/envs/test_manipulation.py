@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from torchrl.envs import ParallelEnv
 from torchrl.envs.utils import check_env_specs
 
 from equirl.envs import ManipulationEnv, Scene, make_env, make_expert
+from equirl.envs.tasks import TASKS
 
 REST = [0, 0, 0, 1]
 UP = (1.0, 0.0, 0.0, 1.0, 0.0)
@@ -227,6 +230,26 @@ def test_closing_twice_is_harmless_and_a_closed_environment_says_so(env):
     env.close()
     with pytest.raises(RuntimeError, match="closed; make a new one"):
         env.reset()
+
+
+def resident_megabytes() -> float:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", TASKS)
+def test_a_thousand_resets_leak_nothing(task):
+    env = make_env(task, image_size=16, robot="hand")
+    for seed in range(120):  # what is cached is cached by then
+        env.set_seed(seed)
+        env.reset()
+    before = resident_megabytes()
+    for seed in range(1000):
+        env.set_seed(seed)
+        env.reset()
+    assert resident_megabytes() - before < 5
+    env.close()
 
 
 def test_many_environments_can_be_opened_and_closed():

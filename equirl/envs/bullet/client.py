@@ -19,15 +19,7 @@ class Client:
         if not pybullet.isNumpyEnabled():
             raise RuntimeError("this build of PyBullet lacks numpy support; install pybullet 3.2.7")
         self._pybullet = pybullet
-        self._id = -1
-        self.reconnect()
-
-    def reconnect(self) -> None:
-        """Connects to a new, empty simulation, and drops the old one."""
-        self.close()
-        for name in [name for name in self.__dict__ if not name.startswith("_")]:
-            del self.__dict__[name]  # bound to the old connection
-        self._id = self._pybullet.connect(self._pybullet.DIRECT)
+        self._id = pybullet.connect(pybullet.DIRECT)
         if self._id < 0:
             raise RuntimeError(f"PyBullet refused another simulation (connect gave {self._id})")
 

@@ -64,25 +64,32 @@ class BodyLoader:
         return loaded
 
     def _shape(self, body: Body, scale: float) -> int:
-        """Returns the id of a collision shape: a box, a convex hull or a compound of hulls."""
-        client, first = self._client, body.pieces[0]
-        if len(body.pieces) > 1:
-            # PyBullet makes a convex hull of each object of a file; no list of hulls it takes.
-            return client.createCollisionShape(
-                client.GEOM_MESH, fileName=str(self._file(body)), meshScale=[scale] * 3
-            )
-        if first.half_extents is not None:
+        first = body.pieces[0]
+        if len(body.pieces) == 1 and first.half_extents is not None:
             half = (scale * first.half_extents).tolist()
-            return client.createCollisionShape(client.GEOM_BOX, halfExtents=half)
-        corners = (scale * first.vertices).tolist()
-        return client.createCollisionShape(client.GEOM_MESH, vertices=corners)
-
-    def _file(self, body: Body) -> Path:
+            return self._client.createCollisionShape(self._client.GEOM_BOX, halfExtents=half)
         # Numbered: a user's mesh may have any name.
-        path = Path(self._folder.name) / f"{list(self._bodies).index(body.name)}.obj"
+        return self.load_shape(str(list(self._bodies).index(body.name)), body.pieces, scale)
+
+    def load_shape(
+        self, label: str, pieces: tuple[ConvexPolyhedron, ...], scale: float = 1.0
+    ) -> int:
+        """Returns the id of the collision shape of convex pieces.
+
+        PyBullet makes a convex hull of each object of a file. It takes no list of hulls, and leaks
+        memory when it is given the corners of one.
+
+        Args:
+            label: names the pieces: others must have another.
+            pieces: the pieces.
+            scale: enlarges them about the origin.
+        """
+        path = Path(self._folder.name) / f"{label}.obj"
         if not path.exists():
-            path.write_text(_wavefront(body.pieces))
-        return path
+            path.write_text(_wavefront(pieces))
+        return self._client.createCollisionShape(
+            self._client.GEOM_MESH, fileName=str(path), meshScale=[scale] * 3
+        )
 
 
 def load_picture(client: Client, body: Body) -> int:

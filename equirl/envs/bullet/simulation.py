@@ -10,7 +10,7 @@ from equirl.envs.bullet.client import Client
 from equirl.envs.bullet.loading import BodyLoader
 from equirl.envs.bullet.models import RobotLoader, robot_model
 from equirl.envs.bullet.robot import Robot
-from equirl.envs.objects import ObjectSet
+from equirl.envs.objects import ConvexPolyhedron, ObjectSet
 from equirl.envs.scene import Scene
 from equirl.envs.workspace import Workspace
 
@@ -24,8 +24,6 @@ _OPPOSED = -0.5  # greatest product of the normals of two fingers that squeeze
 _REST_SPEED, _REST_SPIN, _REST_STEPS = 0.005, 0.1, 4
 _PATIENCE = 240  # steps after which objects count as settled although they move
 _OUT_OF_THE_WAY = (0.0, 0.0, 0.45)  # of falling objects: where the robot waits, m
-# A world made anew leaves some kB behind in PyBullet; a connection made anew does not.
-_WORLDS_A_CONNECTION = 100
 
 
 class Simulation:
@@ -48,14 +46,10 @@ class Simulation:
         self._client = Client()
         self._loader = BodyLoader(self._client, bodies)
         self._robot_loader = RobotLoader(self._client, self._model)
-        self._worlds = 0
         self._make_world()
 
     def _make_world(self) -> None:
         client = self._client
-        self._worlds += 1
-        if self._worlds % _WORLDS_A_CONNECTION == 0:
-            client.reconnect()
         client.resetSimulation()
         client.setGravity(0, 0, -9.81)
         client.setPhysicsEngineParameter(
@@ -197,7 +191,7 @@ class Simulation:
         inner, rim, outer = bin_.floor_half_width, bin_.rim_half_width, bin_.rim_half_width + 0.005
         section = ((inner, 0.0), (rim, bin_.rim_height), (outer, bin_.rim_height), (outer, -0.05))
         corners = [(r, side * r, z) for r, z in section for side in (-1, 1)]
-        shape = client.createCollisionShape(client.GEOM_MESH, vertices=corners)
+        shape = self._loader.load_shape("wall", (ConvexPolyhedron.hull(np.array(corners)),))
         for quarter in range(4):
             turn = (0, 0, np.sin(quarter * np.pi / 4), np.cos(quarter * np.pi / 4))
             wall = client.createMultiBody(0, shape, baseOrientation=turn)

@@ -30,7 +30,10 @@ __all__ = [
 
 
 def make_expert(
-    env: ManipulationEnv, *, horizontal_clip: Literal["norm", "box"] = "norm"
+    env: ManipulationEnv,
+    *,
+    horizontal_clip: Literal["norm", "box"] = "norm",
+    grasp: Literal["random", "aligned"] = "random",
 ) -> Expert:
     """Returns the planner for the task of ``env``.
 
@@ -39,12 +42,17 @@ def make_expert(
         horizontal_clip: how a displacement in x and y is limited to one action: ``"norm"`` keeps
             its direction, so that (x, y) lies in the unit disc; ``"box"`` clips each component, as
             in the paper.
+        grasp: how Clutter Grasping's planner turns the gripper: ``"random"``, whatever the
+            object's orientation, as in the paper, or ``"aligned"``, where least is in the way of
+            the fingers. The cubes of the other tasks are always grasped along their sides.
 
     Raises:
-        ValueError: if there is no planner for the task, or on another ``horizontal_clip``.
+        ValueError: if there is no planner for the task, or on another value of an option.
     """
     if horizontal_clip not in ("norm", "box"):
         raise ValueError(f"horizontal_clip must be 'norm' or 'box', got {horizontal_clip!r}")
+    if grasp not in ("random", "aligned"):
+        raise ValueError(f"grasp must be 'random' or 'aligned', got {grasp!r}")
     # Wrapped environments (transforms) lead to their base.
     base = getattr(env, "base_env", env)
     if not isinstance(base, ManipulationEnv):
@@ -53,4 +61,4 @@ def make_expert(
     if expert is None:
         known = ", ".join(task.__name__ for task in EXPERTS)
         raise ValueError(f"no expert for {type(base.task).__name__}; there are some for: {known}")
-    return expert(base, horizontal_clip)
+    return expert(base, horizontal_clip, grasp)

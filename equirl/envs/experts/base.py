@@ -22,15 +22,17 @@ class Expert(TensorDictModuleBase):
     Args:
         env: the environment it acts in.
         horizontal_clip: ``"norm"`` or ``"box"``, see `equirl.envs.make_expert`.
+        grasp: ``"random"`` or ``"aligned"``, see `equirl.envs.make_expert`.
     """
 
-    def __init__(self, env: ManipulationEnv, horizontal_clip: str):
+    def __init__(self, env: ManipulationEnv, horizontal_clip: str, grasp: str):
         super().__init__()
         self.in_keys = ["depth", "holding"]
         self.out_keys = ["action"]
         # In a list, or torch would register the environment as a sub-module.
         self._env = [env]
         self._horizontal_clip = horizontal_clip
+        self._grasp = grasp
         self._episode: int | None = None
 
     @abstractmethod

@@ -5,9 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from equirl.envs.experts.base import CLOSED, OPEN, Expert, nearest_symmetric_yaw
 from equirl.envs.scene import Scene
+
+# Open fingers, from above: their distance from the middle, half their side with some room, and
+# how far they reach below the centre of an object at a grasp, m.
+_FINGER_CENTRE, _FINGER_REACH, _FINGER_DEPTH = 0.0475, 0.013, 0.02
 
 
 @dataclass
@@ -23,6 +28,8 @@ class ClutterGraspingExpert(Expert):
     """Draws an object, a yaw and a depth for each attempt.
 
     The yaw is independent of the object's: the planner is sub-optimal by design, as the paper's.
+    With ``grasp="aligned"`` the fingers go down where least is in their way, across the object's
+    narrow side if they can.
     """
 
     _on_top = 0.027  # m: an object is not on top if the centre of a higher one is as near
@@ -76,4 +83,27 @@ class ClutterGraspingExpert(Expert):
         return np.flatnonzero(~over.any(1)).tolist()
 
     def _draw_yaw(self, scene: Scene, target: int) -> float:
-        return self._rng.uniform(-np.pi / 2, np.pi / 2)
+        if self._grasp == "random":
+            return self._rng.uniform(-np.pi / 2, np.pi / 2)
+        yaws = np.linspace(-np.pi / 2, np.pi / 2, 36, endpoint=False)
+        placed = [self._surface(scene, k) for k in range(len(scene.objects))]
+        points = np.concatenate(placed) - scene.objects[target, :3]
+        along = points[:, :2] @ np.stack((np.cos(yaws), np.sin(yaws)))
+        across = points[:, :2] @ np.stack((-np.sin(yaws), np.cos(yaws)))
+        under = (np.abs(np.abs(along) - _FINGER_CENTRE) < _FINGER_REACH) & (
+            np.abs(across) < _FINGER_REACH
+        )
+        # What is under the fingers stops them; then, the narrower the better.
+        stop = np.where(under, points[:, 2:], -_FINGER_DEPTH).max(0).clip(-_FINGER_DEPTH)
+        own = slice(sum(map(len, placed[:target])), sum(map(len, placed[: target + 1])))
+        return yaws[np.argmin(stop + 0.1 * np.ptp(along[own], axis=0))]
+
+    def _surface(self, scene: Scene, index: int) -> np.ndarray:
+        """Returns points on the surface of an object, shape (P, 3), m."""
+        (env,) = self._env
+        body = env.task.bodies[scene.names[index]].scaled(scene.scales[index])
+        corners = np.concatenate([piece.vertices[piece.triangles] for piece in body.pieces])
+        middles = (corners + np.roll(corners, 1, axis=1)) / 2
+        points = np.concatenate((corners, middles, corners.mean(1, keepdims=True)), axis=1)
+        turn = Rotation.from_quat(scene.objects[index, 3:])
+        return turn.apply(points.reshape(-1, 3)) + scene.objects[index, :3]

@@ -2,6 +2,18 @@
 
 from equirl.envs.objects.bodies import Body, ConvexPolyhedron, cube, sorted_extents
 from equirl.envs.objects.bowl import bowl
+from equirl.envs.objects.household import household_objects
+from equirl.envs.objects.mesh_folder import MeshError, MeshFolder
 from equirl.envs.objects.object_set import ObjectSet
 
-__all__ = ["Body", "ConvexPolyhedron", "ObjectSet", "bowl", "cube", "sorted_extents"]
+__all__ = [
+    "Body",
+    "ConvexPolyhedron",
+    "MeshError",
+    "MeshFolder",
+    "ObjectSet",
+    "bowl",
+    "cube",
+    "household_objects",
+    "sorted_extents",
+]

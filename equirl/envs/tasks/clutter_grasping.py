@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from equirl.envs.objects import ObjectSet
+from equirl.envs.objects import MeshFolder, ObjectSet, household_objects
 from equirl.envs.scene import Scene
 from equirl.envs.tasks.base import State, Task
 
@@ -69,12 +69,8 @@ class ClutterGrasping(Task):
         if isinstance(self.objects, ObjectSet):
             bodies = self.objects
         elif self.objects == "household":
-            from equirl.envs.objects.household import household_objects
-
             bodies = household_objects()
         else:
-            from equirl.envs.objects.mesh_folder import MeshFolder
-
             bodies = MeshFolder(self.objects)
         return bodies.subset(self.names) if self.names else bodies
 
