@@ -17,7 +17,8 @@ from typing import Any, Literal
 from equirl.envs import make_env, make_expert
 from equirl.envs.tasks import TASKS
 from equirl.symmetry import EnvAudit, SymmetryGroup, audit_env
-from equirl.symmetry.audit import markdown_table, shown
+from equirl.symmetry.audit_quantities import shown
+from equirl.symmetry.audit_result import markdown_table
 
 #: How the expert limits (x, y) of an action; random actions fill the box.
 ACTIONS: dict[str, Literal["norm", "box"] | None] = {

@@ -33,8 +33,8 @@ CONFINED = {
     "wandb": "training/metrics.py",
     "imageio": "training/video.py",
     "gymnasium": "envs/gymnasium.py",
-    "trimesh": "envs/objects/mesh_folder.py",
-    "coacd": "envs/objects/mesh_folder.py",
+    "trimesh": "envs/objects/convex_pieces.py",
+    "coacd": "envs/objects/convex_pieces.py",
     "tqdm": "training/loop.py",
 }
 

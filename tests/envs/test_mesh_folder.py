@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from equirl.envs.objects import Body, ConvexPolyhedron, ObjectSet, mesh_folder
+from equirl.envs.objects import Body, ConvexPolyhedron, ObjectSet, convex_pieces
 from equirl.envs.objects.mesh_folder import MeshError, MeshFolder
 
 trimesh = pytest.importorskip("trimesh")
@@ -68,7 +68,7 @@ def load(folder, shared_cache):
 def quick(monkeypatch):
     """Divides with less care, for tests that are not about the pieces."""
     careless = {"mcts_iterations": 5, "resolution": 200}
-    monkeypatch.setattr(mesh_folder, "_DECOMPOSITION", mesh_folder._DECOMPOSITION | careless)
+    monkeypatch.setattr(convex_pieces, "_DECOMPOSITION", convex_pieces._DECOMPOSITION | careless)
 
 
 @pytest.fixture
@@ -78,7 +78,7 @@ def no_coacd(monkeypatch):
     def fail(parts):
         raise AssertionError("a mesh was divided")
 
-    return lambda: monkeypatch.setattr(mesh_folder, "_decompose", fail)
+    return lambda: monkeypatch.setattr(convex_pieces, "_decompose", fail)
 
 
 def contains(piece: ConvexPolyhedron, point) -> bool:
@@ -155,15 +155,24 @@ def test_explicit_scale_out_of_bounds_shows_the_numbers(folder, load, scale, exp
         load(scale=scale)
 
 
-def test_holes_stay_open(folder, load):
-    annulus().export(folder / "ring.obj")
-    body = load()["ring"]
+def assert_open_ring(body: Body):
     assert 4 <= len(body.pieces) <= 16
     assert max(len(piece.vertices) for piece in body.pieces) <= 32
     axis = np.linspace(-0.01, 0.01, 5)
     assert not any(contains(piece, (0, 0, z)) for piece in body.pieces for z in axis)
     around = [(0.028 * np.cos(a), 0.028 * np.sin(a), 0) for a in np.arange(0, 6, 0.5)]
     assert all(any(contains(piece, point) for piece in body.pieces) for point in around)
+
+
+def test_holes_stay_open(folder, load, quick):
+    annulus().export(folder / "ring.obj")
+    assert_open_ring(load()["ring"])
+
+
+@pytest.mark.slow
+def test_holes_stay_open_with_all_care(folder, load):
+    annulus().export(folder / "ring.obj")
+    assert_open_ring(load()["ring"])
 
 
 def test_overlapping_closed_parts_are_divided_one_by_one(folder, load, quick):
@@ -183,7 +192,7 @@ def test_at_most_max_pieces(folder, load, quick):
 
 def test_an_open_surface_is_given_walls_and_logged(folder, tmp_path, monkeypatch, caplog):
     coarse = {"preprocess_resolution": 20, "threshold": 0.5, "mcts_iterations": 5}
-    monkeypatch.setattr(mesh_folder, "_DECOMPOSITION", mesh_folder._DECOMPOSITION | coarse)
+    monkeypatch.setattr(convex_pieces, "_DECOMPOSITION", convex_pieces._DECOMPOSITION | coarse)
     mesh = box(4, 3, 3)
     mesh.update_faces(np.arange(12) > 0)
     mesh.export(folder / "open.obj")
@@ -192,7 +201,7 @@ def test_an_open_surface_is_given_walls_and_logged(folder, tmp_path, monkeypatch
     assert "open.obj is not a closed surface" in caplog.text
 
 
-def test_inverted_triangles_make_no_difference(folder, load):
+def test_inverted_triangles_make_no_difference(folder, load, quick):
     box(4, 3, 2).export(folder / "a.obj")
     inverted = box(4, 3, 2)
     inverted.invert()
@@ -201,16 +210,15 @@ def test_inverted_triangles_make_no_difference(folder, load):
     assert volumes == pytest.approx([0.09 * 0.0675 * 0.045] * 2)
 
 
-def test_warm_and_cold_cache_give_the_same_bits(folder, tmp_path, quick, no_coacd):
-    annulus().export(folder / "ring.stl")
+def test_warm_and_cold_cache_give_the_same_bits(folder, tmp_path, load, quick, no_coacd):
+    annulus().export(folder / "ring.obj")
     box(3, 4, 5).export(folder / "box.obj")
-    first = MeshFolder(folder, cache=tmp_path / "first")
-    second = MeshFolder(folder, cache=tmp_path / "second")
-    assert_same(first, second)
+    first = load()
+    assert_same(first, MeshFolder(folder, cache=tmp_path / "cold"))
     no_coacd()
-    assert_same(first, MeshFolder(folder, cache=tmp_path / "first"))
+    assert_same(first, load())
     # How large and heavy they are made is no matter of the cache.
-    half = MeshFolder(folder, cache=tmp_path / "first", mass=0.3, max_grasp_width=0.035)
+    half = load(mass=0.3, max_grasp_width=0.035)
     np.testing.assert_allclose(half["ring"].vertices, first["ring"].vertices / 2, atol=1e-9)
 
 
@@ -336,13 +344,13 @@ def test_two_files_of_one_name_are_refused(folder):
 def test_a_crash_of_coacd_refuses_the_mesh_only(folder, tmp_path, monkeypatch):
     annulus().export(folder / "ring.obj")
     crash = "import os, sys; print('Assertion failed', file=sys.stderr, flush=True); os.abort()"
-    monkeypatch.setattr(mesh_folder, "_PROGRAM", crash)
+    monkeypatch.setattr(convex_pieces, "_PROGRAM", crash)
     with pytest.raises(
         MeshError, match=r"ring\.obj: coacd failed \(exit code -6\): Assertion fail"
     ):
         MeshFolder(folder, cache=tmp_path / "cache")
-    monkeypatch.setattr(mesh_folder, "_PROGRAM", "import time; time.sleep(60)")
-    monkeypatch.setattr(mesh_folder, "_PATIENCE", 0.1)
+    monkeypatch.setattr(convex_pieces, "_PROGRAM", "import time; time.sleep(60)")
+    monkeypatch.setattr(convex_pieces, "_PATIENCE", 0.1)
     with pytest.raises(MeshError, match=r"did not divide its 96 triangles within 0\.1 s"):
         MeshFolder(folder, cache=tmp_path / "cache")
     assert not (tmp_path / "cache").exists()
