@@ -66,6 +66,7 @@ class DemosConfig:
     """Expert demonstrations stored before training."""
 
     episodes: int = 20
+    grasp: str = "random"  # of Clutter Grasping's expert: "random", as in the paper, or "aligned"
 
 
 @dataclass
@@ -151,13 +152,26 @@ class EvaluateJob:
     video_episodes: int = 3
 
 
+@dataclass
+class WatchJob:
+    """What the command line of ``experiments/watch.py`` takes."""
+
+    env: EnvConfig = field(default_factory=EnvConfig)
+    policy: str = "expert"  # or "random", or the folder of a run, whose environment is then used
+    episodes: int = 3
+    sheet_episodes: int = 3  # the first ones, shown on the contact sheet
+    seed: int = 0
+    output: str = ""  # a folder for film and sheet; outputs/watch/<task> when empty
+    fps: int = 4  # steps a second
+    size: int = 384  # pixels a side of each of the film's two pictures
+
+
 def validate(config: Config) -> Config:
     """Checks every value that has a range.
 
     Raises:
         ConfigError: Names the first key whose value no run can have, and what it takes.
     """
-    from equirl.envs.tasks import TASKS, make_task
     from equirl.modules.backend import BACKENDS
     from equirl.modules.layout import check_sizes
     from equirl.symmetry import SymmetryGroup
@@ -175,15 +189,11 @@ def validate(config: Config) -> Config:
     except ValueError as error:
         raise ConfigError(f"group={config.group}: {error}") from None
     _choice("mode", config.mode, "strict", "paper")
-    _choice("env.task", config.env.task, *TASKS)
-    try:
-        make_task(config.env.task, **config.env.options)
-    except (ValueError, ImportError) as error:
-        raise ConfigError(f"env.options: {error}") from None
-    _choice("env.robot", config.env.robot, "panda", "hand")
+    _validate_env(config.env)
     _choice("method", config.method.name, "equivariant", "cnn")
     _choice("algorithm", config.algorithm.name, "sac")
     _choice("augmentation", config.augmentation.name, "buffer", "none")
+    _choice("demos.grasp", config.demos.grasp, "random", "aligned")
     _choice("logging.wandb_mode", config.logging.wandb_mode, "offline", "online")
     _choice("backend", config.backend, *BACKENDS)
     try:
@@ -191,7 +201,6 @@ def validate(config: Config) -> Config:
     except ValueError as error:
         raise ConfigError(f"method.hidden or env.image_size: {error}") from None
     at_least("method.head_width", config.method.head_width, 0)
-    at_least("env.max_steps", config.env.max_steps, 1)
     at_least("algorithm.batch_size", config.algorithm.batch_size, 1)
     at_least("augmentation.copies", config.augmentation.copies, 0)
     at_least("demos.episodes", config.demos.episodes, 0)
@@ -229,6 +238,30 @@ def validate(config: Config) -> Config:
 def _choice(key: str, value: object, *allowed: object) -> None:
     if value not in allowed:
         raise ConfigError(f"{key}={value}: expected one of {', '.join(map(str, allowed))}")
+
+
+def _validate_env(env: EnvConfig) -> None:
+    from equirl.envs.tasks import TASKS, make_task
+
+    _choice("env.task", env.task, *TASKS)
+    try:
+        make_task(env.task, **env.options)
+    except (ValueError, ImportError) as error:
+        raise ConfigError(f"env.options: {error}") from None
+    _choice("env.robot", env.robot, "panda", "hand")
+    if env.max_steps < 1:
+        raise ConfigError(f"env.max_steps={env.max_steps}: expected 1 or more")
+
+
+def _validate_watch(job: WatchJob) -> WatchJob:
+    _validate_env(job.env)
+    for key, value in (("env.image_size", job.env.image_size), ("size", job.size)):
+        if value < 2 or value % 2:
+            raise ConfigError(f"{key}={value}: expected an even number, 2 or more")
+    for key, lowest in (("episodes", 1), ("sheet_episodes", 1), ("seed", 0), ("fps", 1)):
+        if getattr(job, key) < lowest:
+            raise ConfigError(f"{key}={getattr(job, key)}: expected {lowest} or more")
+    return job
 
 
 def _validate_evaluation(job: EvaluateJob) -> EvaluateJob:
@@ -270,6 +303,8 @@ def to_config(values: Any, schema: type[Config] = Config) -> Any:
         raise ConfigError(str(error).splitlines()[0] + f" (key {error.full_key})") from None
     if isinstance(config, EvaluateJob):
         return _validate_evaluation(config)
+    if isinstance(config, WatchJob):
+        return _validate_watch(config)
     assert isinstance(config, Config)
     return validate(config)
 
@@ -316,7 +351,8 @@ def register() -> None:
     from hydra.core.config_store import ConfigStore
 
     store = ConfigStore.instance()
-    train = OmegaConf.structured(TrainJob)
-    OmegaConf.set_struct(train.env.options, False)  # the task itself checks their names
-    store.store(name="train_schema", node=train)
+    for name, schema in (("train_schema", TrainJob), ("watch_schema", WatchJob)):
+        node = OmegaConf.structured(schema)
+        OmegaConf.set_struct(node.env.options, False)  # the task itself checks their names
+        store.store(name=name, node=node)
     store.store(name="evaluate_schema", node=EvaluateJob)

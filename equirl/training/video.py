@@ -2,21 +2,92 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from equirl.envs import ManipulationEnv
+from equirl.modules import shared_filters
 
-from .evaluation import play
-
-__all__ = ["film_policy"]
+__all__ = ["Frame", "film_policy", "open_film", "record"]
 
 _SIDE = 384  # pixels of each of the two pictures
+COLORS = "viridis_r"  # of depths; near is bright
+EXPONENT = 0.6  # of depths before they are coloured: near ones, where it matters, differ more
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A moment of an episode.
+
+    Attributes:
+        picture: Of the scene, shape (P, P, 3), uint8.
+        depth: What the network sees, shape (S, S), in metres below the end effector.
+        deepest: The floor's depth with the gripper at the top of the workspace, m.
+        holding: Whether the gripper holds an object; the network is told.
+        reward: What the action before earned; 0 at the start.
+        action: What the policy then does, shape (5,); None at the end.
+    """
+
+    picture: np.ndarray
+    depth: np.ndarray
+    deepest: float
+    holding: bool
+    reward: float = 0.0
+    action: np.ndarray | None = None
+
+
+def record(
+    env: ManipulationEnv,
+    policy: TensorDictModuleBase,
+    *,
+    seed: int | None = None,
+    device: torch.device | str = "cpu",
+    side: int = _SIDE,
+) -> list[Frame]:
+    """Plays a greedy episode.
+
+    Args:
+        env: Renders the scene.
+        policy: Acts deterministically.
+        seed: The scene; when None it is what the next reset of ``env`` gives.
+        device: Where the policy lives.
+        side: P, pixels of a picture of the scene.
+
+    Returns:
+        A frame for the start and one for each step.
+    """
+    if seed is not None:
+        env.set_seed(seed, static_seed=True)
+    current = env.reset()
+    frames = [_frame(env, current, side)]
+    done = False
+    with torch.no_grad(), shared_filters(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        while not done:
+            action = policy(current.copy().to(device))["action"].cpu()
+            frames[-1] = replace(frames[-1], action=action.numpy())
+            stepped = env.step(current.set("action", action))
+            current, done = step_mdp(stepped), stepped["next", "done"].item()
+            frames.append(_frame(env, current, side, stepped["next", "reward"].item()))
+    return frames
+
+
+def _frame(env: ManipulationEnv, seen: TensorDictBase, side: int, reward: float = 0.0) -> Frame:
+    return Frame(
+        picture=env.render(side, side),
+        depth=seen["depth"][0].numpy(),
+        deepest=env.workspace.z_max,
+        holding=bool(seen["holding"].item()),
+        reward=reward,
+    )
 
 
 def film_policy(
@@ -40,33 +111,43 @@ def film_policy(
 
     Returns:
         ``path``.
+
+    Raises:
+        OSError: The file cannot be written.
     """
-    import imageio.v2 as imageio
-
-    deepest = env.observation_spec["depth"].high.max().item()
-
-    writer: Any = imageio.get_writer(path, fps=fps, macro_block_size=None, quality=7)
-    with writer:
-
-        def film(depth: torch.Tensor) -> None:
-            writer.append_data(
-                np.hstack([env.render(_SIDE, _SIDE), _depth_picture(depth, deepest)])
-            )
-
+    with open_film(path, fps=fps) as add:
         for seed in seeds:
-            play(env, policy, seed, device=device, on_step=film)
+            for frame in record(env, policy, seed=seed, device=device):
+                add(frame)
     return path
 
 
-def _depth_picture(depth: torch.Tensor, deepest: float) -> np.ndarray:
-    """A depth image (1, S, S) in metres up to ``deepest`` as an RGB picture, near is bright."""
+@contextmanager
+def open_film(path: Path, *, fps: int = 4) -> Iterator[Callable[[Frame], None]]:
+    """Opens an MP4 file and gives the function that adds a frame to it.
+
+    Args:
+        path: The file to write.
+        fps: Frames a second.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    import imageio.v2 as imageio
+
+    path.open("wb").close()  # the encoder is a process of its own and would fail in silence
+    writer: Any = imageio.get_writer(path, fps=fps, macro_block_size=None, quality=7)
+    with writer:
+        yield lambda frame: writer.append_data(np.hstack([frame.picture, _depth_picture(frame)]))
+    if path.stat().st_size == 0:
+        raise OSError(f"nothing could be written to {path}; is the disk full?")
+
+
+def _depth_picture(frame: Frame) -> np.ndarray:
+    """The depth image in colours, as large as the picture of the scene; pixels kept sharp."""
     import matplotlib
 
-    near = 1 - depth[0].numpy() / deepest
-    return _enlarged((matplotlib.colormaps["viridis"](near)[..., :3] * 255).astype(np.uint8))
-
-
-def _enlarged(picture: np.ndarray) -> np.ndarray:
-    """Resizes a square picture (S, S, 3) to the film's size, pixels kept sharp."""
-    index = np.arange(_SIDE) * len(picture) // _SIDE
-    return picture[index][:, index]
+    share = np.clip(frame.depth / frame.deepest, 0, 1) ** EXPONENT
+    colors = (matplotlib.colormaps[COLORS](share)[..., :3] * 255).astype(np.uint8)
+    index = np.arange(len(frame.picture)) * len(colors) // len(frame.picture)
+    return colors[index][:, index]

@@ -1,0 +1,154 @@
+"""Looking at tasks, policies and objects, as a user calls it."""
+
+import importlib.util
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import imageio.v2 as imageio
+import imageio_ffmpeg
+import numpy as np
+import pytest
+
+from equirl.config import to_config
+
+ROOT = Path(__file__).parents[2]
+SMALL = ["env.image_size=16", "env.robot=hand", "size=32"]
+
+
+def load(script: str):
+    specification = importlib.util.spec_from_file_location(
+        script, ROOT / f"experiments/{script}.py"
+    )
+    module = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def watch(monkeypatch, capsys):
+    """Calls the entry point in this process; returns what it prints, or its complaint."""
+    monkeypatch.setenv("HYDRA_MAIN_MODULE", "__main__")  # configuration beside the script's file
+    main = load("watch").main
+
+    def call(*arguments: str) -> str:
+        monkeypatch.setattr(sys, "argv", ["watch.py", *SMALL, *arguments])
+        try:
+            main()
+        except SystemExit as exit:
+            assert exit.code != 0
+            return f"{exit.code}\n{capsys.readouterr().err}"
+        return capsys.readouterr().out
+
+    return call
+
+
+def frames_of(film: Path, side: int) -> np.ndarray:
+    """The frames of a film, shape (T, side, 2 side, 3)."""
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", film, "-f", "rawvideo"]
+    done = subprocess.run([*command, "-pix_fmt", "rgb24", "-"], capture_output=True, check=True)
+    return np.frombuffer(done.stdout, np.uint8).reshape(-1, side, 2 * side, 3)
+
+
+def check(folder: Path, printed: str, side: int) -> None:
+    """The film has a frame a step and one more an episode; the sheet shows something."""
+    assert f"film: {folder / 'film.mp4'}" in printed
+    assert f"sheet: {folder / 'sheet.png'}" in printed
+    lengths = [int(steps) for steps in re.findall(r"episode \d.* (\d+) step", printed)]
+    pictures = frames_of(folder / "film.mp4", side)
+    assert len(pictures) == sum(lengths) + len(lengths) and pictures[0].std() > 10
+    sheet = imageio.imread(folder / "sheet.png")
+    assert sheet.shape[1] > 800 and sheet.std() > 30
+
+
+def test_the_expert(watch, tmp_path):
+    printed = watch("env=block_pushing", "policy=expert", "episodes=1", f"output={tmp_path}")
+    assert "episode 1: success after" in printed
+    check(tmp_path, printed, 32)
+
+
+def test_a_scene_of_clutter_goes_on(watch, tmp_path):
+    printed = watch(
+        "env=clutter_grasping",
+        "policy=random",
+        "env.max_steps=2",
+        "env.options.object_count=2",
+        "episodes=2",
+        f"output={tmp_path}",
+    )
+    assert "episode 1: no success in 2 steps" in printed
+    assert "episode 2, the scene goes on: no success in 2 steps" in printed
+    check(tmp_path, printed, 32)
+
+
+def test_the_policy_of_a_run_in_its_own_environment(watch, tmp_path, monkeypatch):
+    from equirl.training import train
+
+    values = {
+        "env": {"task": "block_picking", "image_size": 16, "max_steps": 3, "robot": "hand"},
+        "method": {"name": "equivariant", "hidden": 8},
+        "algorithm": {"name": "sac", "batch_size": 2},
+        "augmentation": {"name": "none"},
+        "demos": {"episodes": 0},
+        "evaluation": {"final_episodes": 1, "video_episodes": 0},
+        "logging": {"progress": False},
+        "steps": 1,
+    }
+    train(to_config(values), tmp_path / "run")
+    policy = f"policy={tmp_path / 'run'}"
+    assert "env.image_size=16: the environment is that of the run" in watch(policy)
+    monkeypatch.setattr(sys.modules[__name__], "SMALL", ["size=32"])
+    output = tmp_path / "watched"
+    printed = watch(policy, "episodes=1", f"output={output}")
+    assert "in 3 steps" in printed
+    check(output, printed, 32)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["policy=exprt"], "policy=exprt: expected expert, random or the folder of a run"),
+        (["colour=red"], "colour"),
+        (["env=block_stacking"], "block_stacking"),
+        (["env.options.colour=red"], "block_picking has no option colour"),
+        (["env.max_steps=0"], "env.max_steps=0: expected 1 or more"),
+        (["env.image_size=7"], "env.image_size=7: expected an even number"),
+        (["episodes=0"], "episodes=0: expected 1 or more"),
+        (["size=33"], "size=33: expected an even number"),
+        (["fps=slow"], "slow"),
+        (["output=/proc/none"], "cannot write output=/proc/none"),
+    ],
+)
+def test_bad_input_ends_in_a_sentence_that_names_it(watch, arguments, named):
+    complaint = watch(*arguments)
+    assert named in complaint and "Traceback" not in complaint
+
+
+def test_a_folder_without_a_run_is_no_policy(watch, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "SMALL", [])
+    assert "not the folder of a run" in watch(f"policy={tmp_path}")
+
+
+def test_every_household_object_is_drawn(tmp_path, capsys):
+    sheet = tmp_path / "objects.png"
+    load("object_sheet").main(["--output", str(sheet), "--size", "24", "--columns", "38"])
+    assert f"76 objects: {sheet}" in capsys.readouterr().out
+    picture = imageio.imread(sheet)[..., :3]
+    assert picture.shape[1] > 38 * 24 and picture.std() > 10
+
+
+def test_a_sheet_of_ones_own_meshes(tmp_path, capsys, monkeypatch):
+    trimesh = pytest.importorskip("trimesh")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    (tmp_path / "meshes").mkdir()
+    trimesh.creation.box((2, 3, 4)).export(tmp_path / "meshes" / "brick.obj")
+    sheet = tmp_path / "own.png"
+    main = load("object_sheet").main
+    main(["--meshes", str(tmp_path / "meshes"), "--output", str(sheet)])
+    assert "1 objects" in capsys.readouterr().out
+    assert imageio.imread(sheet).std() > 10
+    with pytest.raises(SystemExit, match=r"error: .*absent does not exist"):
+        main(["--meshes", str(tmp_path / "absent"), "--output", str(sheet)])
+    with pytest.raises(SystemExit, match="cannot write --output"):
+        main(["--meshes", str(tmp_path / "meshes"), "--output", str(tmp_path / "no" / "a.png")])
