@@ -117,6 +117,26 @@ def test_collection_continues_from_its_state_dict(env):
     assert all((a == b).all() for a, b in zip(rest, expected[1:], strict=True))
 
 
+def test_collection_continues_on_a_scene_that_goes_on():
+    def collect(skip: int, state=None):
+        env = make_env("clutter_grasping", image_size=16, robot="hand")
+        collector = DemonstrationCollector(env, episodes=4, seed=1)
+        if state is not None:
+            collector.load_state_dict(state)
+        episodes = iter(collector)
+        found = [next(episodes) for _ in range(skip)] if skip else list(episodes)
+        counts = [len(env.get_scene().objects)]
+        env.close()
+        return found, collector.state_dict(), counts
+
+    expected, _, (left,) = collect(skip=0)
+    assert left == 2  # the fourth of five objects is in the gripper: one heap, four episodes
+    found, state, _ = collect(skip=2)
+    rest, _, _ = collect(skip=0, state=state)
+    for a, b in zip([*found, *rest], expected, strict=True):
+        assert (a == b).all()
+
+
 def test_set_seed_starts_over_and_next_ends(env):
     collector = DemonstrationCollector(env, episodes=1, seed=0)
     (first,) = list(collector)

@@ -57,6 +57,27 @@ def test_training_leaves_a_folder_worth_opening(finished):
     assert list(finished.glob("tensorboard/**/events*"))
 
 
+@pytest.mark.parametrize("task", ["clutter_grasping", "block_pushing", "block_in_bowl"])
+def test_every_task_trains(task, tmp_path):
+    options = ["env.options.lift_height=0.12"] if task == "clutter_grasping" else []
+    code, out, err = call("train.py", *SMOKE, f"env={task}", *options, f"output={tmp_path / task}")
+    assert code == 0, err
+    assert "of 3 episodes succeed" in out
+    with open(tmp_path / task / "metrics.csv") as file:
+        last = list(csv.DictReader(file))[-1]
+    assert float(last["loss_qvalue"]) > 0 and float(last["loss_actor"]) != 0
+    config = (tmp_path / task / "config.yaml").read_text()
+    assert f"task: {task}" in config and (not options or "lift_height: 0.12" in config)
+
+
+def test_an_impossible_scene_ends_in_one_sentence(tmp_path):
+    arguments = ["env=block_pushing", "env.options.goal_distance=0.9", f"output={tmp_path / 'run'}"]
+    code, _, err = call("train.py", *SMOKE, *arguments)
+    assert code == 1 and "no place in 20000 tries for a goal" in err and "Traceback" not in err
+    code, _, err = call("train.py", *SMOKE, "env=block_pushing", "env.options.goal_sides=0.1")
+    assert code == 1 and "env.options: block_pushing has no option goal_sides" in err
+
+
 def test_evaluation_of_a_finished_run(finished, tmp_path):
     film = tmp_path / "film.mp4"
     code, out, err = call("evaluate.py", f"run={finished}", "episodes=2", f"video={film}")
