@@ -187,7 +187,7 @@ def test_benchmark_prints_its_tables():
     for table, row in zip(
         own,
         (
-            "| panda | 64 |",
+            "| clutter_grasping | panda |",
             "| 1,113,118 | 1,178,970 |",
             "| D4 | 16 | 64 |",
             "| D4 | 8 | 64 |",

@@ -59,7 +59,7 @@ def assert_same_run(first, second):
         ),
         ((5,), {"method": {"name": "cnn"}, "augmentation": {"name": "none"}}),
         # Stopped in the first and in a later episode of one heap, and between two.
-        ((3, 9, 12), {"env": {"task": "clutter_grasping", "max_steps": 4}}),
+        ((3, 8, 13), {"env": {"task": "clutter_grasping", "max_steps": 8}}),
     ],
 )
 def test_interrupted_run_equals_uninterrupted(tmp_path, small_config, stops, changes):
