@@ -1,6 +1,7 @@
 """Measures environment, update and acting on this machine; prints Markdown tables.
 
 python experiments/benchmark.py
+python experiments/benchmark.py --only environment profile scaling --threads 1
 python experiments/benchmark.py --only update --threads 2
 python experiments/benchmark.py --only kernels peak threads --threads 1 --repeats 5
 python experiments/benchmark.py --only layers --hidden 16 --image 64 --threads 1
@@ -12,7 +13,6 @@ import argparse
 import os
 import platform
 import resource
-import statistics
 import sys
 import time
 from collections.abc import Callable
@@ -20,6 +20,7 @@ from collections.abc import Callable
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # before TorchRL is imported
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")  # as in train.py
 
+import environment_benchmark
 import side_by_side
 import torch
 from side_by_side import available, milliseconds, take_turns
@@ -28,7 +29,7 @@ from tensordict import TensorDictBase
 from equirl.collectors import DemonstrationCollector
 from equirl.config import Config, to_config
 from equirl.data import make_replay_buffer
-from equirl.envs import make_env, make_expert
+from equirl.envs import make_env
 from equirl.modules import make_actor, make_critic
 from equirl.training import Learner
 
@@ -36,7 +37,9 @@ from equirl.training import Learner
 def main() -> None:
     """Runs the chosen tables."""
     tables: dict[str, Callable[[argparse.Namespace], None]] = {
-        "environment": environment,
+        "environment": environment_benchmark.environment,
+        "profile": environment_benchmark.profile,
+        "scaling": environment_benchmark.scaling,
         "build": build,
         "update": update,
         "acting": acting,
@@ -51,10 +54,12 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--steps", type=int, default=1000, help="environment steps to time")
     parser.add_argument("--repeats", type=int, default=15, help="updates to time")
+    parser.add_argument("--image", type=int, default=128, help="pixels a side")
+    parser.add_argument("--camera", type=int, default=512, help="pixels a side, the earlier way")
+    parser.add_argument("--workers", type=int, nargs="+", default=[2, 4], help="of `scaling`")
     beside_escnn = parser.add_argument_group("tables layers, kernels, peak and threads")
     beside_escnn.add_argument("--group", default="D4")
     beside_escnn.add_argument("--hidden", type=int, nargs="+", default=[16, 32, 64])
-    beside_escnn.add_argument("--image", type=int, default=128)
     beside_escnn.add_argument("--batch", type=int, default=64)
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
@@ -68,32 +73,6 @@ def main() -> None:
             print(f"## {name}\n")
             table(arguments)
             print()
-
-
-def environment(arguments: argparse.Namespace) -> None:
-    """Steps a second of one environment, the expert acting, observation included."""
-    print("| robot | image | steps/s | steps/s with resets | reset ms |")
-    print("| --- | --- | --- | --- | --- |")
-    for robot in ("panda", "hand"):
-        for size in (64, 128):
-            env = make_env("block_picking", image_size=size, robot=robot)
-            expert = make_expert(env)
-            stepping, resetting = [], []
-            current = env.reset()
-            while len(stepping) < arguments.steps:
-                acted = expert(current)
-                start = time.perf_counter()
-                current = env.step(acted)["next"]
-                stepping.append(time.perf_counter() - start)
-                if current["done"].item():
-                    start = time.perf_counter()
-                    current = env.reset()
-                    resetting.append(time.perf_counter() - start)
-            env.close()
-            alone = len(stepping) / sum(stepping)
-            whole = len(stepping) / (sum(stepping) + sum(resetting))
-            reset = 1e3 * statistics.median(resetting)
-            print(f"| {robot} | {size} | {alone:.0f} | {whole:.0f} | {reset:.1f} |")
 
 
 def build(arguments: argparse.Namespace) -> None:

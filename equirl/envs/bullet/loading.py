@@ -23,7 +23,8 @@ class BodyLoader:
         self._client = client
         self._bodies = bodies
         self._folder = tempfile.TemporaryDirectory(prefix="equirl_")
-        self._placeholder = -1
+        #: A visual shape for bodies: without one they would be drawn from their collision shape.
+        self.placeholder = -1
 
     def close(self) -> None:
         """Removes the files; harmless when done before."""
@@ -31,8 +32,7 @@ class BodyLoader:
 
     def begin_world(self) -> None:
         """Prepares a world that has just been made."""
-        # A body without a visual shape would be drawn from its collision shape.
-        self._placeholder = self._client.createVisualShape(
+        self.placeholder = self._client.createVisualShape(
             self._client.GEOM_BOX, halfExtents=(1e-3, 1e-3, 1e-3)
         )
 
@@ -48,7 +48,7 @@ class BodyLoader:
         loaded = client.createMultiBody(
             body.mass,
             self._shape(body, scale),
-            self._placeholder,
+            self.placeholder,
             basePosition=pose[:3].tolist(),
             baseOrientation=pose[3:].tolist(),
         )

@@ -12,7 +12,7 @@ from equirl.envs.bullet.models import RobotLoader, robot_model
 from equirl.envs.bullet.robot import Robot
 from equirl.envs.objects import ConvexPolyhedron, ObjectSet
 from equirl.envs.scene import Scene
-from equirl.envs.workspace import Workspace
+from equirl.envs.workspace import Bin, Workspace
 
 TIME_STEP = 1 / 120
 SOLVER_ITERATIONS = 20
@@ -43,6 +43,7 @@ class Simulation:
         self._bodies = bodies
         self._model = robot_model(robot, workspace)
         self._workspace = workspace
+        self._wall = _wall(workspace.bin)
         self._client = Client()
         self._loader = BodyLoader(self._client, bodies)
         self._robot_loader = RobotLoader(self._client, self._model)
@@ -60,9 +61,9 @@ class Simulation:
             solverResidualThreshold=0,
             enableFileCaching=0,  # or a shape would be that of an earlier file of the same name
         )
+        self._loader.begin_world()
         self._load_bin()
         self._robot = Robot(client, self._robot_loader, TIME_STEP, self._workspace.max_aperture)
-        self._loader.begin_world()
         self._present: list[tuple[str, float]] = []  # name and scale of each object
         self._ids: list[int] = []
         self._areas = np.zeros((0, 3))
@@ -185,14 +186,18 @@ class Simulation:
         depth = 0.25
         half = (1.0, 1.0, depth / 2)
         shape = client.createCollisionShape(client.GEOM_BOX, halfExtents=half)
-        floor = client.createMultiBody(0, shape, basePosition=(0, 0, -depth / 2))
+        unseen = self._loader.placeholder
+        floor = client.createMultiBody(0, shape, unseen, basePosition=(0, 0, -depth / 2))
         client.changeDynamics(floor, -1, lateralFriction=bin_.floor_friction)
-        # A wall is a wedge, mitred at the corners; four turned copies.
-        inner, rim, outer = bin_.floor_half_width, bin_.rim_half_width, bin_.rim_half_width + 0.005
-        section = ((inner, 0.0), (rim, bin_.rim_height), (outer, bin_.rim_height), (outer, -0.05))
-        corners = [(r, side * r, z) for r, z in section for side in (-1, 1)]
-        shape = self._loader.load_shape("wall", (ConvexPolyhedron.hull(np.array(corners)),))
+        shape = self._loader.load_shape("wall", (self._wall,))
         for quarter in range(4):
             turn = (0, 0, np.sin(quarter * np.pi / 4), np.cos(quarter * np.pi / 4))
-            wall = client.createMultiBody(0, shape, baseOrientation=turn)
+            wall = client.createMultiBody(0, shape, unseen, baseOrientation=turn)
             client.changeDynamics(wall, -1, lateralFriction=bin_.wall_friction)
+
+
+def _wall(bin_: Bin) -> ConvexPolyhedron:
+    """Returns the wall beyond +x: a wedge, mitred at the corners."""
+    inner, rim, outer = bin_.floor_half_width, bin_.rim_half_width, bin_.rim_half_width + 0.005
+    section = ((inner, 0.0), (rim, bin_.rim_height), (outer, bin_.rim_height), (outer, -0.05))
+    return ConvexPolyhedron.hull([(r, side * r, z) for r, z in section for side in (-1, 1)])

@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull, QhullError
 
 Color = tuple[float, float, float, float]
@@ -32,7 +33,7 @@ class ConvexPolyhedron:
     half_extents: np.ndarray | None = None
 
     @classmethod
-    def hull(cls, points: np.ndarray) -> ConvexPolyhedron:
+    def hull(cls, points: ArrayLike) -> ConvexPolyhedron:
         """Returns the convex hull of ``points`` (shape (P, 3), m).
 
         Raises:
