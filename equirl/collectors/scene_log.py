@@ -47,7 +47,7 @@ class SceneLog:
     def step(self, taken: TensorDictBase) -> TensorDictBase:
         """Steps the environment with ``taken["action"]`` and remembers it."""
         stepped = self.env.step(taken)
-        self._actions[-1].append(taken["action"])
+        self._actions[-1].append(taken["action"].clone())
         return stepped
 
     def state_dict(self) -> dict[str, Any]:
@@ -63,11 +63,19 @@ class SceneLog:
 
         Returns:
             The steps of its last episode, as `step` returned them.
+
+        Raises:
+            RuntimeError: if the scene does not go on as it did, in another simulator perhaps.
         """
         self.forget()
         steps: list[TensorDictBase] = []
         for number, actions in enumerate(state["actions"]):
             current, steps = self.begin(state["first"] + number), []
+            if self._first != state["first"]:
+                raise RuntimeError(
+                    f"episode {self._first} began a new scene, but went on with that of episode "
+                    f"{state['first']} when it was recorded: the simulation has changed since"
+                )
             for action in actions:
                 steps.append(self.step(current.copy().set("action", action)))
                 current = steps[-1]["next"].exclude("reward")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from numbers import Integral
 from typing import Any, Literal
 
 from equirl.envs.manipulation import ManipulationEnv
@@ -66,7 +67,7 @@ def make_env(
 
 
 def _is_int(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
+    return isinstance(value, Integral) and not isinstance(value, bool)
 
 
 def _require(valid: bool, name: str, value: object, expected: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from numbers import Integral
 from typing import Any, Literal
 
 import numpy as np
@@ -108,7 +109,10 @@ class ManipulationEnv(EnvBase):
 
     @property
     def episode_seed(self) -> np.random.SeedSequence:
-        """A seed of the present episode's own, for policies that draw numbers (experts)."""
+        """A seed of the present episode, for policies that draw numbers (experts).
+
+        After `set_scene` it is the same for every scene.
+        """
         if self._scene_seed is None:
             return np.random.SeedSequence(0)
         key = (*self._scene_seed.spawn_key, self._scene_episodes)
@@ -116,10 +120,10 @@ class ManipulationEnv(EnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         remaining = self._remaining()
-        scene = None
+        self._state, scene = None, None  # a reset that fails leaves nothing to step on
         if remaining is not None:
             scene = self._sent_home(self._connected().settled(remaining))
-        if scene is None or self._lost_object(scene, None):
+        if scene is None or self._misplaced(scene):
             # One generator a scene: nothing drawn in one changes the next ones.
             (child,) = self._seed_sequence.spawn(1)
             scene = self._new_scene(np.random.default_rng(child))
@@ -138,17 +142,27 @@ class ManipulationEnv(EnvBase):
 
     def _new_scene(self, rng: np.random.Generator) -> Scene:
         task, home = self.task, self._sent_home(None)
+        fault = ""
         for _ in range(task.placement_tries):
             scene = task.sample(rng, home).named(task.bodies)
-            if not task.drops_objects:
+            if task.drops_objects:
+                scene = self._connected().settled(scene, one_by_one=True)
+            fault = self._misplaced(scene)
+            if not fault:
                 return scene
-            scene = self._connected().settled(scene, one_by_one=True)
-            if not self._lost_object(scene, None):
-                return scene
-        raise PlacementError(
-            f"no scene in {task.placement_tries} tries: each time an object came to rest more than "
-            f"{task.margin} m outside the workspace of ±{self.workspace.half_width} m"
-        )
+        raise PlacementError(f"no scene in {task.placement_tries} tries; in the last, {fault}")
+
+    def _misplaced(self, scene: Scene) -> str:
+        """Returns why no episode can start from ``scene``, or nothing."""
+        space, margin = self.workspace, self.task.margin
+        for name, pose in zip(scene.names, scene.objects, strict=True):
+            if not space.contains(pose[:3], margin):
+                where = np.round(pose[:3], 3).tolist()
+                return f"{name} was at {where} m, more than {margin} m outside {space}"
+        for x, y, _ in scene.areas:
+            if max(abs(x), abs(y)) > space.half_width:
+                return f"an area was at ({x:.3f}, {y:.3f}) m, outside {space}"
+        return ""
 
     def _sent_home(self, scene: Scene | None) -> Scene:
         """Returns ``scene`` with the robot where episodes start; without objects if None."""
@@ -264,6 +278,11 @@ class ManipulationEnv(EnvBase):
         if len(scene.areas) != wanted:
             raise ValueError(f"the scene has {len(scene.areas)} areas, the task has {wanted}")
         scene = scene.named(self.task.bodies)
+        expected = tuple(self.task.bodies)
+        if not self.task.drops_objects and scene.names != expected:
+            raise ValueError(f"the scene has the objects {scene.names}, the task has {expected}")
+        if not scene.names:
+            raise ValueError("the scene has no object")
         self._forget_scene()
         return self._begin(scene)
 
@@ -272,7 +291,13 @@ class ManipulationEnv(EnvBase):
 
         Needs no display. The first call loads the robot's meshes; what is simulated, and how fast,
         does not change.
+
+        Raises:
+            ValueError: if a side is no positive integer.
         """
+        for name, value in (("width", width), ("height", height)):
+            if not isinstance(value, Integral) or value < 1:
+                raise ValueError(f"{name} must be a positive integer (pixels), got {value!r}")
         simulation = self._connected()
         if self._camera is None:
             task = self.task

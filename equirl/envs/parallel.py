@@ -12,6 +12,7 @@ from signal import Signals
 from typing import Any
 
 import numpy as np
+from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, ParallelEnv
 
 from equirl.envs.factory import make_env
@@ -32,7 +33,8 @@ class WatchedParallelEnv(ParallelEnv):
     Args:
         names: what each worker is called in messages; as many workers.
         create_env_fn: makes each worker's environment.
-        answer_within: s that a worker may take to start, to reset or to step.
+        answer_within: s that the workers may take to start, and each to reset, step or end. With
+            ``mp_start_method="spawn"`` allow for the imports of all of them.
         mp_start_method: how processes start: ``"fork"`` takes a fraction of a second, ``"spawn"``
             and ``"forkserver"`` import everything again but are safe beside CUDA.
         options: further arguments of `ParallelEnv`.
@@ -56,7 +58,11 @@ class WatchedParallelEnv(ParallelEnv):
         self.names = list(names)
         self.answer_within = answer_within
         super().__init__(
-            len(create_env_fn), list(create_env_fn), mp_start_method=mp_start_method, **options
+            len(create_env_fn),
+            list(create_env_fn),
+            mp_start_method=mp_start_method,
+            shutdown_timeout=min(answer_within, 10.0),
+            **options,
         )
 
     def _start_workers(self) -> None:
@@ -70,9 +76,46 @@ class WatchedParallelEnv(ParallelEnv):
         finally:
             gc.unfreeze()
 
-    def _set_seed(self, seed: int | None) -> None:
+    def set_seed(self, seed: int | None = None, static_seed: bool | None = False) -> int | None:
+        """Seeds each worker, see `ParallelEnv.set_seed`."""
+        self._require_workers()
+        if self.is_closed:
+            self.start()
         with self._bounded("take a seed"):
-            super()._set_seed(seed)
+            return super().set_seed(seed, static_seed)
+
+    def _reset(self, *args: Any, **kwargs: Any) -> TensorDictBase:
+        self._require_workers()
+        return super()._reset(*args, **kwargs)
+
+    def _step(self, *args: Any, **kwargs: Any) -> TensorDictBase:
+        self._require_workers()
+        return super()._step(*args, **kwargs)
+
+    def step_and_maybe_reset(
+        self, tensordict: TensorDictBase
+    ) -> tuple[TensorDictBase, TensorDictBase]:
+        """Steps all workers and resets those that are done, see `EnvBase`."""
+        self._require_workers()
+        return super().step_and_maybe_reset(tensordict)
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Ends the workers, also when some have ended already."""
+        if self._dead():
+            self._end_workers()
+            return
+        super().close(raise_if_closed=raise_if_closed)
+
+    def _dead(self) -> set[int]:
+        """Returns the workers whose processes have ended although nobody told them to."""
+        if self.is_closed:
+            return set()
+        return {k for k, process in enumerate(self._workers) if not process.is_alive()}
+
+    def _require_workers(self) -> None:
+        dead = self._dead()
+        if dead:
+            self._give_up(dead, died="while nothing was asked of it")
 
     def _wait_for_workers(self, workers_range: Iterable[int]) -> None:
         """Returns when all of ``workers_range`` have done what they were told."""
@@ -86,7 +129,7 @@ class WatchedParallelEnv(ParallelEnv):
             pending -= done
             if not pending:
                 return
-            dead = {worker for worker in pending if not self._workers[worker].is_alive()}
+            dead = pending & self._dead()
             if dead:
                 self._give_up(dead, died="while it was stepped or reset")
             if time.monotonic() > deadline:
@@ -118,14 +161,17 @@ class WatchedParallelEnv(ParallelEnv):
         watcher.start()
         try:
             yield
-        except (EOFError, OSError, RuntimeError) as error:
+        except BaseException as error:
             over.set()
             watcher.join()
-            if hung:
-                self._give_up(hung, hung=what, cause=error)
             time.sleep(_GRACE)  # for a process to end whose pipe has
             dead = {k for k, process in enumerate(self._workers) if not process.is_alive()}
-            self._give_up(dead, died=f"before it could {what}", cause=error)
+            if hung:
+                self._give_up(hung, hung=what, cause=error)
+            if dead and isinstance(error, Exception):
+                self._give_up(dead, died=f"before it could {what}", cause=error)
+            self._end_workers()
+            raise
         finally:
             over.set()
 
@@ -144,6 +190,11 @@ class WatchedParallelEnv(ParallelEnv):
             what = f"{self.names[worker]} (worker {worker} of {len(self.names)}"
             code = f", {_exit(process.exitcode)}" if died else ""
             told.append(f"{what}, process {process.pid}{code})")
+        self._end_workers()
+        fault = f"died {died}" if died else f"did not {hung} within {self.answer_within:g} s"
+        raise WorkerError(f"{'; '.join(told)} {fault}") from cause
+
+    def _end_workers(self) -> None:
         for process in self._workers:
             process.kill()
         for process in self._workers:
@@ -151,8 +202,6 @@ class WatchedParallelEnv(ParallelEnv):
         for channel in self.parent_channels:
             channel.close()
         self.is_closed = True
-        fault = f"died {died}" if died else f"did not {hung} within {self.answer_within:g} s"
-        raise WorkerError(f"{'; '.join(told) or 'a worker'} {fault}") from cause
 
 
 def _exit(code: int | None) -> str:

@@ -57,6 +57,12 @@ class Workspace:
     arm_base_x: float = -0.55
     bin: Bin = field(default_factory=Bin)
 
+    def __str__(self) -> str:
+        return (
+            f"the workspace (x and y within ±{self.half_width} m, "
+            f"z from {self.z_min} to {self.z_max} m)"
+        )
+
     def clip(self, position: np.ndarray) -> np.ndarray:
         """Returns the point of the workspace nearest to ``position`` (shape (3,), m)."""
         width = self.half_width

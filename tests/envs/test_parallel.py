@@ -124,6 +124,48 @@ def test_a_worker_that_fails_is_named_in_time_and_the_data_stay(fault, message):
 
 
 @pytest.mark.parametrize(
+    "call",
+    [
+        lambda env, td: env.step(up(td)),
+        lambda env, td: env.reset(),
+        lambda env, td: env.set_seed(3),
+        lambda env, td: env.rollout(3, policy=up, break_when_any_done=False),
+    ],
+)
+def test_a_worker_that_died_between_two_calls_is_named(call):
+    env = watched(good, good)
+    td = env.reset()
+    os.kill(env._workers[1].pid, signal.SIGKILL)
+    env._workers[1].join()
+    with pytest.raises(WorkerError, match=r"^env1 \(worker 1 of 2, process \d+, SIGKILL\) died"):
+        call(env, td)
+    assert env.is_closed
+
+
+def test_a_worker_that_stands_still_is_named_when_it_is_seeded_and_does_not_hold_up_the_end():
+    env = watched(good, good, within=1.0)
+    env.reset()
+    os.kill(env._workers[1].pid, signal.SIGSTOP)
+    start = time.monotonic()
+    with pytest.raises(WorkerError, match=r"^env1 .* did not take a seed within 1 s"):
+        env.set_seed(3)
+    other = watched(good, good, within=1.0)
+    other.reset()
+    os.kill(other._workers[0].pid, signal.SIGSTOP)
+    other.close()
+    assert time.monotonic() - start < 15
+
+
+def test_closing_after_a_worker_died_is_harmless():
+    env = watched(good, good)
+    env.reset()
+    os.kill(env._workers[0].pid, signal.SIGKILL)
+    env._workers[0].join()
+    env.close()
+    assert env.is_closed
+
+
+@pytest.mark.parametrize(
     ("maker", "message"),
     [
         (hanging, r"^env1 \(worker 1 of 2, process \d+\) did not start within 2 s"),

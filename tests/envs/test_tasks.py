@@ -241,6 +241,19 @@ def test_every_number_can_be_set():
         ("block_pushing", {"goal_raise": -1}, "goal_raise must be .* 0 or more, got -1"),
         ("block_in_bowl", {"require_release": "no"}, "require_release must be True or False"),
         ("block_in_bowl", {"bowl_width": 0.05}, "bowl_width must be .*got 0.05"),
+        ("block_in_bowl", {"bowl_distance": 0.05}, "bowl_distance must be above 0.122, .*got 0.05"),
+        ("block_pushing", {"cube_side": 0.07}, "max_height must be above 0.035, .*got 0.03"),
+        ("block_picking", {"cube_side": 0.09}, "cube_side must be less than 0.08, .* got 0.09"),
+        ("block_picking", {"lift_height": 0.3}, "lift_height must be less than 0.25, .* got 0.3"),
+        (
+            "clutter_grasping",
+            {"drop_height": 0.4},
+            "drop_height must be less than 0.35, .* got 0.4",
+        ),
+        ("clutter_grasping", {"largest_scale": "x"}, "largest_scale must be .* got 'x'"),
+        ("clutter_grasping", {"largest_scale": float("inf")}, "largest_scale must be .* got inf"),
+        ("clutter_grasping", {"names": 5}, "names must be a list of names, got 5"),
+        ("clutter_grasping", {"objects": 5}, "objects must be a folder or an ObjectSet, got 5"),
         ("clutter_grasping", {"object_count": 0}, "object_count must be an integer above 0, got 0"),
         ("clutter_grasping", {"object_count": 2.5}, "object_count must be an integer .* got 2.5"),
         ("clutter_grasping", {"largest_scale": 0.5}, "at least smallest_scale=0.8, got 0.5"),
@@ -273,7 +286,17 @@ def test_impossible_numbers_are_named(name, options, message):
         (
             "clutter_grasping",
             {"objects": bricks(), "start_half_width": 0.4, "placement_tries": 3},
-            "no scene in 3 tries: each time an object came to rest",
+            "no scene in 3 tries; in the last, brick0 was at .* outside",
+        ),
+        (
+            "block_picking",
+            {"cube_side": 0.015, "placement_tries": 5},
+            r"no scene in 5 tries; in the last, cube was at \[.*0.008\] m, more than 0.0 m outside the w",
+        ),
+        (
+            "block_pushing",
+            {"goal_half_width": 50.0, "placement_tries": 5},
+            "no scene in 5 tries; in the last, an area was at",
         ),
     ],
 )
@@ -281,6 +304,21 @@ def test_impossible_scenes_end_with_the_number_of_tries_and_the_reason(name, opt
     env = make_env(name, image_size=8, robot="hand", **options)
     with pytest.raises(PlacementError, match=message):
         env.reset()
+    with pytest.raises(RuntimeError, match="no scene yet; reset it first"):
+        env.get_scene()
+    env.close()
+
+
+def test_numbers_may_be_of_numpy():
+    assert make_task("block_pushing", goal_side=np.float32(0.1)).areas[0].side == np.float32(0.1)
+    make_env("block_picking", image_size=np.int64(16)).close(raise_if_closed=False)
+
+
+def test_scenes_may_be_wider_than_the_bin_as_long_as_some_fit():
+    env = make_env("block_picking", image_size=8, robot="hand", start_half_width=0.3)
+    for _ in range(10):
+        env.reset()
+        assert env.workspace.contains(env.get_scene().objects[0, :3])
     env.close()
 
 
@@ -293,4 +331,25 @@ def test_scenes_of_other_tasks_are_refused():
         env.set_scene(Scene([0, 0, 0.2], 0.0, 0.08, cube, names=["mug"], areas=[[0, 0, 0]]))
     with pytest.raises(RuntimeError, match="no scene yet; reset it first"):
         env.get_scene()
+    env.close()
+
+
+def test_scenes_that_a_task_could_not_judge_are_refused():
+    env = make_env("block_in_bowl", image_size=8, robot="hand")
+    poses = [[0.05, 0, 0.034, *REST], [-0.1, 0, 0.025, *REST]]
+    with pytest.raises(ValueError, match=r"has the objects \('cube',\), the task has"):
+        env.set_scene(Scene([0, 0, 0.2], 0.0, 0.08, poses[:1]))
+    with pytest.raises(ValueError, match=r"has the objects \('bowl', 'cube'\), the task has"):
+        env.set_scene(Scene([0, 0, 0.2], 0.0, 0.08, poses, names=["bowl", "cube"]))
+    heap = make_env("clutter_grasping", image_size=8, robot="hand", objects=bricks())
+    with pytest.raises(ValueError, match="the scene has no object"):
+        heap.set_scene(HOME)
+
+
+@pytest.mark.parametrize("size", [(0, 10), (10, -4), (10, 2.5)])
+def test_pictures_of_impossible_sizes_are_refused(size):
+    env = make_env("block_picking", image_size=8, robot="hand")
+    env.reset()
+    with pytest.raises(ValueError, match=r"must be a positive integer \(pixels\), got"):
+        env.render(*size)
     env.close()

@@ -5,14 +5,17 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from numbers import Integral, Real
 from typing import Any, ClassVar
 
 import numpy as np
 
 from equirl.envs.objects import Body, ObjectSet
 from equirl.envs.scene import Area, Scene
+from equirl.envs.workspace import Workspace
 
 _BATCH = 256  # points drawn at a time
+WORKSPACE = Workspace()  # what numbers of a task are measured against
 
 
 class PlacementError(RuntimeError):
@@ -101,6 +104,10 @@ class Task(ABC):
         """
         return None
 
+    def require_below(self, name: str, limit: float, what: str) -> None:
+        """Refuses the value of a field of ``limit`` or more; ``what`` says what that is."""
+        self.require(name, self._number(name) < limit, f"less than {limit:g}, {what}")
+
     def require(self, name: str, valid: bool, expected: str) -> None:
         """Refuses the value of a field unless ``valid``."""
         if not valid:
@@ -123,7 +130,7 @@ class Task(ABC):
     def _number(self, name: str) -> float:
         """Returns the value of a field, or -inf when it is no number of the right kind."""
         value = getattr(self, name)
-        allowed = int if self._kind(name) == "an integer" else (int, float)
+        allowed = Integral if self._kind(name) == "an integer" else Real
         right = isinstance(value, allowed) and not isinstance(value, bool)
         return value if right and np.isfinite(value) else -np.inf
 

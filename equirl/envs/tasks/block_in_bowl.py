@@ -50,7 +50,18 @@ class BlockInBowl(BlockTask):
         self.require_positive("bowl_width", "bowl_height", "bowl_mass", "reach", "max_tilt")
         self.require_non_negative("bowl_friction", "bowl_half_width", "bowl_distance")
         self.require("require_release", isinstance(self.require_release, bool), "True or False")
-        self.require("bowl_width", self.bowl_width > 2 * self.cube_side, "twice the cube's side")
+        side, rim = self.cube_side, self.bowl_width / np.cos(np.pi / 8)
+        self.require(
+            "bowl_width",
+            self.bowl_width > 2 * side,
+            f"above {2 * side:g}, two sides of the cube (m)",
+        )
+        apart = (np.sqrt(2) * side + rim) / 2
+        self.require(
+            "bowl_distance",
+            self.bowl_distance > apart,
+            f"above {apart:.3f}, or cube and bowl would overlap (m)",
+        )
 
     @cached_property
     def bowl(self) -> Body:

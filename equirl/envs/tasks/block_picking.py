@@ -9,7 +9,7 @@ import numpy as np
 
 from equirl.envs.objects import ObjectSet
 from equirl.envs.scene import Scene
-from equirl.envs.tasks.base import State, lying
+from equirl.envs.tasks.base import WORKSPACE, State, lying
 from equirl.envs.tasks.block_task import BlockTask
 
 
@@ -26,6 +26,7 @@ class BlockPicking(BlockTask):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.require_positive("lift_height")
+        self.require_below("lift_height", WORKSPACE.z_max, "the top of the workspace (m)")
 
     @cached_property
     def bodies(self) -> ObjectSet:

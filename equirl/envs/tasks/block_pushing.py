@@ -39,6 +39,12 @@ class BlockPushing(BlockTask):
         super().__post_init__()
         self.require_positive("goal_side", "reach", "max_height")
         self.require_non_negative("goal_raise", "goal_half_width", "goal_distance")
+        lying = self.cube_side / 2
+        self.require(
+            "max_height",
+            self.max_height > lying,
+            f"above {lying:g}, the height of a lying cube's centre (m)",
+        )
 
     @cached_property
     def bodies(self) -> ObjectSet:

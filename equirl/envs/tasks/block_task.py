@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from equirl.envs.objects import Body, cube
-from equirl.envs.tasks.base import Task, lying, rejection_sample
+from equirl.envs.tasks.base import WORKSPACE, Task, lying, rejection_sample
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +31,7 @@ class BlockTask(Task):
         super().__post_init__()
         self.require_positive("cube_side", "cube_mass")
         self.require_non_negative("cube_friction", "start_yaw")
+        self.require_below("cube_side", WORKSPACE.max_aperture, "the opening of the gripper (m)")
 
     @cached_property
     def cube(self) -> Body:

@@ -11,7 +11,7 @@ import numpy as np
 
 from equirl.envs.objects import MeshFolder, ObjectSet, household_objects
 from equirl.envs.scene import Scene
-from equirl.envs.tasks.base import State, Task
+from equirl.envs.tasks.base import WORKSPACE, State, Task
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +30,8 @@ class ClutterGrasping(Task):
         drop_height: objects are dropped from here, one by one, m.
         start_yaw: yaws are drawn within +-this, rad.
         lift_height: the end effector must be above this, m.
-        max_scene_episodes: a scene is given up after so many episodes; 0: never.
+        max_scene_episodes: a scene is given up after so many episodes, of which each reset begins
+            one; 0: never.
     """
 
     margin: float = 0.05
@@ -50,16 +51,22 @@ class ClutterGrasping(Task):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.require_positive("object_count", "smallest_scale", "drop_height", "lift_height")
+        self.require_positive("object_count", "smallest_scale", "largest_scale", "lift_height")
+        self.require_positive("drop_height")
         self.require_non_negative("start_yaw", "max_scene_episodes")
+        self.require_below("lift_height", WORKSPACE.z_max, "the top of the workspace (m)")
+        self.require_below("drop_height", 0.35, "where the robot waits (m)")
         self.require(
             "largest_scale",
             self.largest_scale >= self.smallest_scale,
             f"a number of at least smallest_scale={self.smallest_scale}",
         )
-        self.require("names", not isinstance(self.names, str), "a list of names")
+        named = isinstance(self.names, Sequence) and not isinstance(self.names, str)
+        self.require("names", named, "a list of names")
+        kinds = (str, Path, ObjectSet)
+        self.require("objects", isinstance(self.objects, kinds), "a folder or an ObjectSet")
         try:
-            assert len(self.bodies) > 0  # loads the set: its faults are found here
+            _ = self.bodies  # loads the set: its faults are found here
         except KeyError as error:
             raise ValueError(error.args[0]) from None
 
