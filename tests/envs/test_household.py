@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from equirl.envs.bullet.client import Client
-from equirl.envs.bullet.loading import load_body, load_collision_shape, load_placeholder
+from equirl.envs.bullet.loading import BodyLoader
 from equirl.envs.objects import Body, ConvexPolyhedron, sorted_extents
 from equirl.envs.objects.household import KINDS, household_objects
 from equirl.envs.objects.household.solids import block, laid, turned
@@ -129,14 +129,14 @@ def dropped() -> dict[str, tuple[np.ndarray, float]]:
     floor = client.createCollisionShape(client.GEOM_BOX, halfExtents=(10, 10, 0.1))
     floor = client.createMultiBody(0, floor, basePosition=(0, 0, -0.1))
     client.changeDynamics(floor, -1, lateralFriction=0.5)
-    placeholder, rng = load_placeholder(client), np.random.default_rng(0)
+    loader, rng = BodyLoader(client, household_objects()), np.random.default_rng(0)
+    loader.begin_world()
     places, loaded, height = {}, {}, np.array([0, 0, 0.03])
     for k, body in enumerate(BODIES):
-        index = load_body(client, body, load_collision_shape(client, body), placeholder)
         place = np.array([0.5 * (k % 10), 0.5 * (k // 10), -body.vertices[:, 2].min()])
         turn = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi)).as_quat()
-        client.resetBasePositionAndOrientation(index, (place + height).tolist(), turn)
-        places[body.name], loaded[body.name] = place, index
+        pose = np.concatenate((place + height, turn))
+        places[body.name], loaded[body.name] = place, loader.load(body.name, 1.0, pose)
     for _ in range(360):
         client.stepSimulation()
     result = {}
@@ -145,6 +145,7 @@ def dropped() -> dict[str, tuple[np.ndarray, float]]:
         speed = np.linalg.norm(client.getBaseVelocity(index)[0])
         result[name] = (np.subtract(position, places[name]), speed)
     client.close()
+    loader.close()
     return result
 
 
