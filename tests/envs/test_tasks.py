@@ -154,13 +154,13 @@ def test_clutter_draws_kinds_sizes_and_places():
 def test_a_heap_has_come_to_rest_within_the_bin(clutter):
     for seed in range(6):
         clutter.set_seed(seed)
-        clutter.reset()
+        td = clutter.reset()
         start = clutter.get_scene()
         assert len(start.objects) == 5
         assert all(clutter.workspace.contains(pose[:3], margin=0.05) for pose in start.objects)
-        act(clutter, clutter.reset(), 1, 0, 0, 0, 0)
+        act(clutter, td, 1, 0, 0, 0, 0)
         moved = clutter.get_scene().objects[:, :3] - start.objects[:, :3]
-        assert np.median(np.linalg.norm(moved, axis=1)) < 5e-3
+        assert np.linalg.norm(moved, axis=1).max() < 5e-3
 
 
 def test_a_grasped_object_is_gone_in_the_next_episode(clutter):

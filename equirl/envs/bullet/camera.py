@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 
 from equirl.envs.bullet.client import Client
-from equirl.envs.bullet.floor import Floor, View
+from equirl.envs.bullet.floor import Floor, Viewpoint
 from equirl.envs.bullet.loading import load_picture
 from equirl.envs.bullet.models import RobotLoader, robot_model
 from equirl.envs.objects import Body, ConvexPolyhedron, ObjectSet
@@ -18,7 +18,7 @@ from equirl.envs.workspace import Workspace
 _WALL_COLOR: Color = (0.55, 0.65, 0.75, 1.0)
 _FINGER_COLOR: Color = (0.25, 0.26, 0.30, 1.0)
 _WALL_THICKNESS = 0.008  # m
-_CELL = View(eye=(0.56, -0.52, 0.82), target=(-0.06, 0.01, 0.13), angle=43.0)
+_CELL = Viewpoint(eye=(0.56, -0.52, 0.82), target=(-0.06, 0.01, 0.13), angle=43.0)
 
 
 class Camera:
@@ -40,7 +40,7 @@ class Camera:
         areas: tuple[Area, ...],
         robot: str | None,
         workspace: Workspace,
-        view: View = _CELL,
+        view: Viewpoint = _CELL,
     ):
         self._bodies = bodies
         self._client = Client()

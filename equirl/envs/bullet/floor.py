@@ -27,7 +27,7 @@ _SHARPEST = 0.006  # least width of a shadow's edge, m
 
 
 @dataclass(frozen=True)
-class View:
+class Viewpoint:
     """Where a picture is taken from.
 
     Attributes:
@@ -102,7 +102,7 @@ class Floor:
         lines = lined[:, None] | lined
         self._bare = np.where(lines[..., None], _LINE_COLOR, _FLOOR_COLOR)
 
-    def background(self, view: View, width: int, height: int) -> Background:
+    def background(self, view: Viewpoint, width: int, height: int) -> Background:
         """Returns what `texture` is to be looked up with for a picture of this size, pixels."""
         ground = view.ground(width, height)
         near, far = _FAR

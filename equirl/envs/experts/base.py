@@ -14,6 +14,8 @@ from equirl.envs.manipulation import ManipulationEnv
 from equirl.envs.scene import Scene
 
 OPEN, HALF_OPEN, CLOSED = 1.0, 0.0, -1.0
+# A gripper narrower than this (m) has not come to grasp: the diagonal of the 5 cm cube is 0.071 m.
+NARROW = 0.072
 
 
 class Expert(TensorDictModuleBase):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from equirl.envs.experts.base import CLOSED, OPEN, Expert, box_yaw, nearest_symmetric_yaw
+from equirl.envs.experts.base import CLOSED, NARROW, OPEN, Expert, box_yaw, nearest_symmetric_yaw
 from equirl.envs.scene import Scene
 
 
@@ -14,8 +14,6 @@ class BlockInBowlExpert(Expert):
     _above = 0.10  # m over the cube, and over the bowl
     _near = 0.012  # m, what counts as being at a way-point
     _over_bowl = 0.03  # m, where the cube would fall into it
-    # A gripper narrower than this cannot have come to grasp: the cube's diagonal is 0.071 m.
-    _narrow = 0.072
 
     def plan(self, scene: Scene, held: int | None) -> np.ndarray:
         """Returns the action for a state, shape (5,)."""
@@ -23,7 +21,7 @@ class BlockInBowlExpert(Expert):
         if held == 0:
             return self._carry(scene, bowl)
         inside = np.hypot(*(cube[:2] - bowl[:2])) < self._over_bowl
-        if scene.aperture < self._narrow or inside:
+        if scene.aperture < NARROW or inside:
             return np.array([OPEN, 0.0, 0.0, 1.0, 0.0])
         yaw = nearest_symmetric_yaw(box_yaw(cube[3:]), scene.yaw, np.pi / 2)
         apart = np.hypot(*(scene.position[:2] - cube[:2]))

@@ -1,6 +1,6 @@
 """Bodies to manipulate."""
 
-from equirl.envs.objects.bodies import Body, ConvexPolyhedron, cube, sorted_extents
+from equirl.envs.objects.bodies import Body, ConvexPolyhedron, cube
 from equirl.envs.objects.bowl import bowl
 from equirl.envs.objects.household import household_objects
 from equirl.envs.objects.mesh_folder import MeshError, MeshFolder
@@ -15,5 +15,4 @@ __all__ = [
     "bowl",
     "cube",
     "household_objects",
-    "sorted_extents",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -162,8 +162,3 @@ def _outward(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     ordered = triangles.copy()
     ordered[inward] = ordered[inward][:, ::-1]
     return ordered
-
-
-def sorted_extents(bodies: Sequence[Body]) -> np.ndarray:
-    """Returns shortest, middle and longest side of each body, shape (N, 3), m."""
-    return np.sort([body.extents for body in bodies], axis=1)

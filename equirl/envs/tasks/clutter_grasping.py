@@ -13,6 +13,9 @@ from equirl.envs.objects import MeshFolder, ObjectSet, household_objects
 from equirl.envs.scene import Scene
 from equirl.envs.tasks.base import WORKSPACE, State, Task
 
+# The robot waits 0.45 m high; the largest objects reach 0.1 m from their centres.
+_HIGHEST_DROP = 0.35  # m
+
 
 @dataclass(frozen=True, kw_only=True)
 class ClutterGrasping(Task):
@@ -55,7 +58,7 @@ class ClutterGrasping(Task):
         self.require_positive("drop_height")
         self.require_non_negative("start_yaw", "max_scene_episodes")
         self.require_below("lift_height", WORKSPACE.z_max, "the top of the workspace (m)")
-        self.require_below("drop_height", 0.35, "where the robot waits (m)")
+        self.require_below("drop_height", _HIGHEST_DROP, "or objects would touch the robot (m)")
         self.require(
             "largest_scale",
             self.largest_scale >= self.smallest_scale,
