@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import dataclass, field, fields, is_dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 from omegaconf import MISSING, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -15,77 +16,113 @@ from yaml import YAMLError
 __all__ = ["Config", "ConfigError", "load_config", "register", "save_config", "to_config"]
 
 
+Job = TypeVar("Job")
+
+
 class ConfigError(ValueError):
     """A key or value that no run can have; the message names it."""
+
+
+def _at_least(default: Any, lowest: float, *, free: bool = False) -> Any:
+    """A number from ``lowest`` on."""
+    return _checked(default, lambda value: value >= lowest, f"{lowest} or more", free)
+
+
+def _within(default: float, low: float, high: float) -> Any:
+    """A number above ``low``, at most ``high``."""
+    expected = f"a number above {low:g}, at most {high:g}"
+    return _checked(default, lambda value: low < value <= high, expected, False)
+
+
+def _one_of(*allowed: str, free: bool = False) -> Any:
+    """One of several words, by default the first."""
+    expected = f"one of {', '.join(allowed)}"
+    return _checked(allowed[0], lambda value: value in allowed, expected, free)
+
+
+def _name_of(*allowed: str) -> Any:
+    """One of several names, none by default: that is up to a file of ``conf``."""
+    return _checked(MISSING, lambda value: value in allowed, f"one of {', '.join(allowed)}", False)
+
+
+def _checked(default: Any, valid: Callable[[Any], bool], expected: str, free: bool) -> Any:
+    metadata = {"valid": valid, "expected": expected, "free": free}
+    return field(default=default, metadata=metadata)
+
+
+def _group(schema: type, *, free: bool = False) -> Any:
+    """A group of keys; ``free`` ones may differ when a run is resumed, see `is_free`."""
+    return field(default_factory=schema, metadata={"free": free})
 
 
 @dataclass
 class EnvConfig:
     """The task and what the robot sees of it."""
 
-    task: str = MISSING
-    image_size: int = 128  # pixels a side; networks take 16, 32, 64, 128 and 256
-    robot: str = "panda"  # "panda" or "hand", a free-flying gripper
-    max_steps: int = 50
-    options: dict[str, Any] = field(default_factory=dict)  # numbers of the task, equirl/envs/tasks
+    task: str = MISSING  # a file of equirl/envs/tasks, or "package.module:Class"
+    image_size: int = _at_least(128, 2)  # pixels a side; networks take 16, 32, 64, 128 and 256
+    robot: str = _one_of("panda", "hand")  # the arm, or its hand alone, flying freely
+    max_steps: int = _at_least(50, 1)
+    options: dict[str, Any] = field(default_factory=dict)  # numbers of the task, see its file
 
 
 @dataclass
 class MethodConfig:
     """The networks."""
 
-    name: str = MISSING  # "equivariant" or "cnn"
-    hidden: int = 64  # width n of the encoder (appendix A); the CNN scales with it
-    head_width: int = 0  # fields of an equivariant critic head; 0: hidden, as in the paper
+    name: str = _name_of("equivariant", "cnn")
+    hidden: int = _at_least(64, 1)  # width n of the encoder (appendix A); the CNN scales with it
+    head_width: int = _at_least(0, 0)  # fields of an equivariant critic head; 0: hidden, as there
 
 
 @dataclass
 class AlgorithmConfig:
     """Soft actor-critic (appendix D)."""
 
-    name: str = MISSING  # "sac"
-    learning_rate: float = 1e-3
-    batch_size: int = 64
-    discount: float = 0.99  # of the learner
-    tau: float = 1e-2  # share of the critic that moves into its target each update
-    alpha: float = 1e-2  # initial temperature
-    target_entropy: float = -5.0
-    averaging: float = 0.0  # decay of the average of the actor that is evaluated; 0: none
+    name: str = _name_of("sac")
+    learning_rate: float = _within(1e-3, 0, 1)
+    batch_size: int = _at_least(64, 1)
+    discount: float = _within(0.99, 0, 1)  # of the learner
+    tau: float = _within(1e-2, 0, 1)  # share of the critic that moves into its target each update
+    alpha: float = _within(1e-2, 0, 1e6)  # initial temperature
+    target_entropy: float = _checked(-5.0, math.isfinite, "a finite number", False)
+    # Decay of the average of the actor that is evaluated; 0: none.
+    averaging: float = _checked(0.0, lambda value: 0 <= value < 1, "0 or more, below 1", False)
 
 
 @dataclass
 class AugmentationConfig:
     """Rotated copies of the replayed transitions (appendix F)."""
 
-    name: str = MISSING  # "buffer" or "none"
-    copies: int = 4
+    name: str = _name_of("buffer", "none")
+    copies: int = _at_least(4, 0)
 
 
 @dataclass
 class DemosConfig:
     """Expert demonstrations stored before training."""
 
-    episodes: int = 20
-    grasp: str = "random"  # of Clutter Grasping's expert: "random", as in the paper, or "aligned"
+    episodes: int = _at_least(20, 0)
+    options: dict[str, Any] = field(default_factory=dict)  # CHOICES of the task's expert
 
 
 @dataclass
 class ReplayConfig:
     """The replay buffer."""
 
-    capacity: int = 100_000  # transitions, copies counted
-    start: int = 100  # transitions stored, copies counted, before updates begin
+    capacity: int = _at_least(100_000, 1)  # transitions, copies counted
+    start: int = _at_least(100, 1)  # transitions stored, copies counted, before updates begin
 
 
 @dataclass
 class EvaluationConfig:
     """Greedy evaluation on scenes that training never sees."""
 
-    every: int = 200  # training steps between evaluations; 0: only after training
-    episodes: int = 20  # validation scenes an evaluation
-    final_episodes: int = 100  # test scenes after training
-    discount: float = 0.99  # of the returns reported, the paper's
-    video_episodes: int = 3  # episodes of the learned policy filmed after training; 0: no video
+    every: int = _at_least(200, 0)  # training steps between evaluations; 0: only after training
+    episodes: int = _at_least(20, 1)  # validation scenes an evaluation
+    final_episodes: int = _at_least(100, 1)  # test scenes after training
+    discount: float = _within(0.99, 0, 1)  # of the returns reported, the paper's
+    video_episodes: int = _at_least(3, 0)  # filmed after training; 0: no video
 
 
 @dataclass
@@ -95,7 +132,7 @@ class LoggingConfig:
     progress: bool = True
     tensorboard: bool = False
     wandb: bool = False
-    wandb_mode: str = "offline"  # or "online"
+    wandb_mode: str = _one_of("offline", "online")
     wandb_project: str = "equirl"
 
 
@@ -103,32 +140,68 @@ class LoggingConfig:
 class Config:
     """A training run."""
 
-    env: EnvConfig = field(default_factory=EnvConfig)
-    method: MethodConfig = field(default_factory=MethodConfig)
-    algorithm: AlgorithmConfig = field(default_factory=AlgorithmConfig)
-    augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
-    demos: DemosConfig = field(default_factory=DemosConfig)
-    replay: ReplayConfig = field(default_factory=ReplayConfig)
-    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
-    logging: LoggingConfig = field(default_factory=LoggingConfig)
-    mode: str = "strict"  # "strict" or "paper": the mathematics, independent of sizes
+    env: EnvConfig = _group(EnvConfig)
+    method: MethodConfig = _group(MethodConfig)
+    algorithm: AlgorithmConfig = _group(AlgorithmConfig)
+    augmentation: AugmentationConfig = _group(AugmentationConfig)
+    demos: DemosConfig = _group(DemosConfig)
+    replay: ReplayConfig = _group(ReplayConfig)
+    evaluation: EvaluationConfig = _group(EvaluationConfig, free=True)
+    logging: LoggingConfig = _group(LoggingConfig, free=True)
+    mode: str = _one_of("strict", "paper")  # the mathematics, independent of sizes
     group: str = "D4"  # C<n> or D<n>
-    steps: int = 10_000  # environment steps, one update each
-    checkpoint_every: int = 500  # steps
-    seed: int = 0
-    device: str = "auto"  # "auto", "cpu" or "cuda:<i>"
-    threads: int = 0  # CPU threads of torch; 0: all cores
-    backend: str = "auto"  # of equivariant encoders: "native", "dense" or "auto", the faster one
+    steps: int = _at_least(10_000, 1, free=True)  # environment steps, one update each
+    checkpoint_every: int = _at_least(500, 1, free=True)  # steps
+    seed: int = _at_least(0, 0)
+    device: str = field(default="auto", metadata={"free": True})  # "auto", "cpu" or "cuda:<i>"
+    threads: int = _at_least(0, 0, free=True)  # CPU threads of torch; 0: all cores
+    backend: str = _one_of("auto", "native", "dense", free=True)  # of equivariant encoders
 
     @property
     def torch_device(self) -> str:
         """The device, ``"auto"`` resolved; a ConfigError if this machine has none such."""
-        return _available_device(self.device)
+        from equirl.modules.layout import resolve_device
+
+        try:
+            device = resolve_device(self.device)
+        except ValueError as error:
+            raise ConfigError(str(error)) from None
+        if device.type not in ("cpu", "cuda"):
+            raise ConfigError(f"device={self.device}: expected auto, cpu or cuda:<i>")
+        return str(device)
 
     @property
     def copies(self) -> int:
         """Augmented copies of each stored transition."""
         return self.augmentation.copies if self.augmentation.name == "buffer" else 0
+
+    def checked(self) -> Config:
+        """This configuration with the group's name in capitals, if its values fit together.
+
+        Raises:
+            ConfigError: They do not; the message names the first that does not.
+        """
+        from equirl.modules.layout import check_sizes
+        from equirl.symmetry import SymmetryGroup
+
+        try:
+            group = SymmetryGroup(self.group).name
+        except ValueError as error:
+            raise ConfigError(f"group={self.group}: {error}") from None
+        _check_task(self.env, self.demos)
+        try:
+            check_sizes(self.method.hidden, self.env.image_size)
+        except ValueError as error:
+            raise ConfigError(f"method.hidden or env.image_size: {error}") from None
+        capacity, versions = self.replay.capacity, self.copies + 1
+        if capacity < versions:
+            raise ConfigError(f"replay.capacity={capacity}: expected {versions} or more")
+        if self.replay.start > capacity - capacity % versions:
+            raise ConfigError(
+                f"replay.start={self.replay.start}: the buffer of {capacity} transitions never "
+                "holds so many"
+            )
+        return replace(self, group=group)
 
 
 @dataclass
@@ -144,153 +217,81 @@ class EvaluateJob:
     """What the command line of ``experiments/evaluate.py`` takes."""
 
     run: str = MISSING  # the folder of a run
-    episodes: int = 100
-    first: int = 0  # number of the first test scene
+    episodes: int = _at_least(100, 1)
+    first: int = _at_least(0, 0)  # number of the first test scene
     device: str = "auto"
-    backend: str = "auto"
+    backend: str = _one_of("auto", "native", "dense")
     video: str = ""  # MP4 file to film the first episodes into
-    video_episodes: int = 3
+    video_episodes: int = _at_least(3, 1)
 
 
 @dataclass
 class WatchJob:
     """What the command line of ``experiments/watch.py`` takes."""
 
-    env: EnvConfig = field(default_factory=EnvConfig)
+    env: EnvConfig = _group(EnvConfig)
     policy: str = "expert"  # or "random", or the folder of a run, whose environment is then used
-    episodes: int = 3
-    sheet_episodes: int = 3  # the first ones, shown on the contact sheet
-    seed: int = 0
+    episodes: int = _at_least(3, 1)
+    sheet_episodes: int = _at_least(3, 1)  # the first ones, shown on the contact sheet
+    seed: int = _at_least(0, 0)
     output: str = ""  # a folder for film and sheet; outputs/watch/<task> when empty
-    fps: int = 4  # steps a second
-    size: int = 384  # pixels a side of each of the film's two pictures
+    fps: int = _at_least(4, 1)  # steps a second
+    # Pixels a side of each of the film's two pictures; video formats want an even number.
+    size: int = _checked(384, lambda value: value >= 2 and value % 2 == 0, "2 or more, even", False)
+
+    def checked(self) -> WatchJob:
+        """This job, if its task exists."""
+        _check_task(self.env)
+        return self
 
 
-def validate(config: Config) -> Config:
-    """Checks every value that has a range.
+def _check_task(env: EnvConfig, demos: DemosConfig | None = None) -> None:
+    from equirl.envs.tasks import find_task, make_task
 
-    Raises:
-        ConfigError: Names the first key whose value no run can have, and what it takes.
-    """
-    from equirl.modules.backend import BACKENDS
-    from equirl.modules.layout import check_sizes
-    from equirl.symmetry import SymmetryGroup
-
-    def at_least(key: str, value: float, lowest: float) -> None:
-        if not value >= lowest:
-            raise ConfigError(f"{key}={value}: expected {lowest} or more")
-
-    def within(key: str, value: float, low: float, high: float) -> None:
-        if not low < value <= high:
-            raise ConfigError(f"{key}={value}: expected a number above {low}, at most {high}")
-
+    if env.image_size % 2:
+        raise ConfigError(f"env.image_size={env.image_size}: expected an even number")
     try:
-        config.group = SymmetryGroup(config.group).name
+        kind = find_task(env.task)
     except ValueError as error:
-        raise ConfigError(f"group={config.group}: {error}") from None
-    _choice("mode", config.mode, "strict", "paper")
-    _validate_env(config.env)
-    _choice("method", config.method.name, "equivariant", "cnn")
-    _choice("algorithm", config.algorithm.name, "sac")
-    _choice("augmentation", config.augmentation.name, "buffer", "none")
-    _choice("demos.grasp", config.demos.grasp, "random", "aligned")
-    _choice("logging.wandb_mode", config.logging.wandb_mode, "offline", "online")
-    _choice("backend", config.backend, *BACKENDS)
+        raise ConfigError(f"env.task: {error}") from None
     try:
-        check_sizes(config.method.hidden, config.env.image_size)
-    except ValueError as error:
-        raise ConfigError(f"method.hidden or env.image_size: {error}") from None
-    at_least("method.head_width", config.method.head_width, 0)
-    at_least("algorithm.batch_size", config.algorithm.batch_size, 1)
-    at_least("augmentation.copies", config.augmentation.copies, 0)
-    at_least("demos.episodes", config.demos.episodes, 0)
-    at_least("replay.start", config.replay.start, 1)
-    at_least("replay.capacity", config.replay.capacity, config.copies + 1)
-    if config.replay.start > config.replay.capacity - config.replay.capacity % (config.copies + 1):
-        raise ConfigError(
-            f"replay.start={config.replay.start}: the buffer of {config.replay.capacity} "
-            "transitions never holds so many"
-        )
-    if not math.isfinite(config.algorithm.target_entropy):
-        raise ConfigError(
-            f"algorithm.target_entropy={config.algorithm.target_entropy}: expected a finite number"
-        )
-    at_least("evaluation.every", config.evaluation.every, 0)
-    at_least("evaluation.episodes", config.evaluation.episodes, 1)
-    at_least("evaluation.final_episodes", config.evaluation.final_episodes, 1)
-    at_least("evaluation.video_episodes", config.evaluation.video_episodes, 0)
-    at_least("steps", config.steps, 1)
-    at_least("checkpoint_every", config.checkpoint_every, 1)
-    at_least("seed", config.seed, 0)
-    at_least("threads", config.threads, 0)
-    within("algorithm.learning_rate", config.algorithm.learning_rate, 0, 1)
-    within("algorithm.discount", config.algorithm.discount, 0, 1)
-    within("evaluation.discount", config.evaluation.discount, 0, 1)
-    within("algorithm.tau", config.algorithm.tau, 0, 1)
-    if not 0 <= config.algorithm.averaging < 1:
-        raise ConfigError(
-            f"algorithm.averaging={config.algorithm.averaging}: expected 0 or more, below 1"
-        )
-    within("algorithm.alpha", config.algorithm.alpha, 0, 1e6)
-    return config
-
-
-def _choice(key: str, value: object, *allowed: object) -> None:
-    if value not in allowed:
-        raise ConfigError(f"{key}={value}: expected one of {', '.join(map(str, allowed))}")
-
-
-def _validate_env(env: EnvConfig) -> None:
-    from equirl.envs.tasks import TASKS, make_task
-
-    _choice("env.task", env.task, *TASKS)
-    try:
-        make_task(env.task, **env.options)
+        task = make_task(kind, **env.options)
     except (ValueError, ImportError) as error:
         raise ConfigError(f"env.options: {error}") from None
-    _choice("env.robot", env.robot, "panda", "hand")
-    if env.max_steps < 1:
-        raise ConfigError(f"env.max_steps={env.max_steps}: expected 1 or more")
-
-
-def _validate_watch(job: WatchJob) -> WatchJob:
-    _validate_env(job.env)
-    for key, value in (("env.image_size", job.env.image_size), ("size", job.size)):
-        if value < 2 or value % 2:
-            raise ConfigError(f"{key}={value}: expected an even number, 2 or more")
-    for key, lowest in (("episodes", 1), ("sheet_episodes", 1), ("seed", 0), ("fps", 1)):
-        if getattr(job, key) < lowest:
-            raise ConfigError(f"{key}={getattr(job, key)}: expected {lowest} or more")
-    return job
-
-
-def _validate_evaluation(job: EvaluateJob) -> EvaluateJob:
-    from equirl.modules.backend import BACKENDS
-
-    for key, lowest in (("episodes", 1), ("first", 0), ("video_episodes", 1)):
-        if getattr(job, key) < lowest:
-            raise ConfigError(f"{key}={getattr(job, key)}: expected {lowest} or more")
-    _choice("backend", job.backend, *BACKENDS)
-    return job
-
-
-def _available_device(device: str) -> str:
-    import torch
-
-    if device == "auto":
-        return "cuda:0" if torch.cuda.is_available() else "cpu"
+    if demos is None or not demos.episodes:
+        return
+    if task.expert is None:
+        raise ConfigError(
+            f"demos.episodes={demos.episodes}: {env.task} has no expert; expected demos.episodes=0"
+        )
     try:
-        parsed = torch.device(device)
-    except RuntimeError:
-        parsed = None
-    if parsed is None or parsed.type not in ("cpu", "cuda"):
-        raise ConfigError(f"device={device}: expected auto, cpu or cuda:<i>")
-    if parsed.type == "cuda" and (parsed.index or 0) >= torch.cuda.device_count():
-        raise ConfigError(f"device={device}: this machine has {torch.cuda.device_count()} GPUs")
-    return device
+        task.expert.resolve(demos.options)
+    except ValueError as error:
+        raise ConfigError(f"demos.options: {error}") from None
 
 
-def to_config(values: Any, schema: type[Config] = Config) -> Any:
+def _check_values(config: Any, prefix: str = "") -> None:
+    """Checks each value against the range that its field declares."""
+    for entry in fields(config):
+        value = getattr(config, entry.name)
+        if is_dataclass(value):
+            _check_values(value, f"{prefix}{entry.name}.")
+        elif "valid" in entry.metadata and not entry.metadata["valid"](value):
+            key = f"{prefix}{entry.name}".removesuffix(".name")
+            raise ConfigError(f"{key}={value}: expected {entry.metadata['expected']}")
+
+
+def is_free(key: str) -> bool:
+    """Whether a run may be resumed with another value: the key does not touch what is learned.
+
+    Args:
+        key: A key of :class:`Config`, ``"env.task"``, or a group of them, ``"env"``.
+    """
+    known = {entry.name: entry.metadata.get("free", False) for entry in fields(Config)}
+    return known.get(key.partition(".")[0], False)
+
+
+def to_config(values: Any, schema: type[Job] = Config) -> Job:  # type: ignore[assignment]
     """Turns a mapping (or an OmegaConf node) into a validated configuration.
 
     Raises:
@@ -298,15 +299,11 @@ def to_config(values: Any, schema: type[Config] = Config) -> Any:
     """
     try:
         merged = OmegaConf.merge(OmegaConf.structured(schema), values)
-        config = OmegaConf.to_object(merged)
+        config = cast(Job, OmegaConf.to_object(merged))
     except OmegaConfBaseException as error:
         raise ConfigError(str(error).splitlines()[0] + f" (key {error.full_key})") from None
-    if isinstance(config, EvaluateJob):
-        return _validate_evaluation(config)
-    if isinstance(config, WatchJob):
-        return _validate_watch(config)
-    assert isinstance(config, Config)
-    return validate(config)
+    _check_values(config)
+    return config.checked() if hasattr(config, "checked") else config
 
 
 def save_config(config: Config, path: Path) -> None:
@@ -353,6 +350,9 @@ def register() -> None:
     store = ConfigStore.instance()
     for name, schema in (("train_schema", TrainJob), ("watch_schema", WatchJob)):
         node = OmegaConf.structured(schema)
-        OmegaConf.set_struct(node.env.options, False)  # the task itself checks their names
+        # The task and its expert check the names of their options themselves.
+        OmegaConf.set_struct(node.env.options, False)
+        if "demos" in node:
+            OmegaConf.set_struct(node.demos.options, False)
         store.store(name=name, node=node)
     store.store(name="evaluate_schema", node=EvaluateJob)

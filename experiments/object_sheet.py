@@ -86,7 +86,9 @@ def draw_objects(objects: ObjectSet, path: Path, columns: int = 12, size: int = 
 def portraits(objects: ObjectSet, size: int) -> list[np.ndarray]:
     """Returns a picture of each object, shape (size, size, 3), uint8."""
     near = max(max(np.linalg.norm(body.vertices, axis=1)) for body in objects.values())
-    view = Viewpoint(eye=(2.9 * near, -2.5 * near, 3.6 * near), target=(0, 0, 0.2 * near), angle=19.0)
+    view = Viewpoint(
+        eye=(2.9 * near, -2.5 * near, 3.6 * near), target=(0, 0, 0.2 * near), angle=19.0
+    )
     camera = Camera(objects, (), None, Workspace(bin=Bin(floor_half_width=6 * near)), view)
     pictures = []
     for name, body in objects.items():

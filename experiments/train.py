@@ -18,7 +18,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from equirl.config import Config, ConfigError, TrainJob, load_config, register, to_config
+from equirl.config import Config, ConfigError, TrainJob, is_free, load_config, register, to_config
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL logs to the standard output
 # Threads that wait for one another soon sleep: where other work keeps a core busy, spinning
@@ -82,15 +82,11 @@ def _job(values: DictConfig, multirun: bool) -> tuple[Config, Path]:
 def _resumed(folder: Path) -> Config:
     """The configuration of an interrupted run, with what may be changed on the way."""
     changes = [text for text in HydraConfig.get().overrides.task if not text.startswith("resume=")]
-    free = (
-        *("steps=", "device=", "threads=", "backend=", "checkpoint_every="),
-        *("logging.", "evaluation."),
-    )
     for text in changes:
-        if not text.startswith(free):
+        if not is_free(text.partition("=")[0]):
+            free = ", ".join(key for key in Config.__dataclass_fields__ if is_free(key))
             raise ConfigError(
-                f"{text}: a run is resumed with its own configuration; "
-                f"only {', '.join(key.rstrip('=') for key in free)} may change"
+                f"{text}: a run is resumed with its own configuration; only {free} may change"
             )
     config = load_config(folder / "config.yaml")
     return to_config(OmegaConf.merge(OmegaConf.structured(config), OmegaConf.from_dotlist(changes)))

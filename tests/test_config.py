@@ -56,18 +56,25 @@ def test_group_is_normalised():
         ({"method": {"name": "ferm"}}, "method=ferm: expected one of equivariant, cnn"),
         ({"algorithm": {"name": "sacfd"}}, "algorithm=sacfd: expected one of sac"),
         ({"augmentation": {"name": "online"}}, "augmentation=online"),
-        ({"env": {"task": "block_stacking"}}, "env.task=block_stacking: expected one of block_pi"),
+        ({"env": {"task": "block_stacking"}}, "env.task: unknown task .*block_picking"),
         ({"env": {"task": "block_picking", "image_size": 48}}, "image_size=48.*16, 32, 64"),
         ({"env": {"task": "block_picking", "robot": "ur5"}}, "robot=ur5: expected one of panda"),
         (
             {"env": {"task": "block_picking", "options": {"lift": 1}}},
-            "env.options: block_picking has no option lift; its options: .*lift_height",
+            "env.options: BlockPicking has no option lift; its options: .*lift_height",
         ),
         (
             {"env": {"task": "clutter_grasping", "options": {"objects": "/nonexistent"}}},
             "env.options: .*/nonexistent",
         ),
-        ({"demos": {"grasp": "best"}}, "demos.grasp=best: expected one of random, aligned"),
+        (
+            {"env": {"task": "clutter_grasping"}, "demos": {"options": {"grasp": "best"}}},
+            "demos.options: grasp must be 'random' or 'aligned', got 'best'",
+        ),
+        (
+            {"demos": {"options": {"grip": 1}}},
+            "demos.options: BlockPickingExpert has no option grip",
+        ),
         ({"method": {"name": "equivariant", "hidden": 12}}, "hidden=12.*multiple of 8"),
         ({"algorithm": {"name": "sac", "tau": 0.0}}, "algorithm.tau=0.0"),
         ({"replay": {"capacity": 3}}, "replay.capacity=3: expected 5 or more"),

@@ -1,7 +1,6 @@
 """Simulated manipulation as TorchRL environments, with scripted experts."""
 
-from equirl.envs.experts import make_expert
-from equirl.envs.factory import make_env
+from equirl.envs.factory import make_env, make_expert
 from equirl.envs.manipulation import ManipulationEnv
 from equirl.envs.parallel import WorkerError, make_parallel_env
 from equirl.envs.scene import Scene

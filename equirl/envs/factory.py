@@ -1,23 +1,26 @@
-"""`make_env`: an environment from plain, validated arguments."""
+"""`make_env` and `make_expert`: an environment and its planner from plain, validated arguments."""
 
 from __future__ import annotations
 
 from numbers import Integral
-from typing import Any, Literal
+from typing import Any
 
+from torchrl.envs import EnvBase
+
+from equirl.envs.expert import Expert
 from equirl.envs.manipulation import ManipulationEnv
-from equirl.envs.tasks import make_task
+from equirl.envs.tasks import Task, make_task
 from equirl.envs.workspace import Workspace
 
 
 def make_env(
-    task: str,
+    task: str | type[Task],
     *,
     image_size: int = 128,
     seed: int = 0,
-    robot: Literal["panda", "hand"] = "panda",
+    robot: str = "panda",
     max_steps: int = 50,
-    time_limit: Literal["truncate", "terminate"] = "truncate",
+    time_limit: str = "truncate",
     **options: Any,
 ) -> ManipulationEnv:
     """Returns an environment of the paper's simulation.
@@ -25,8 +28,8 @@ def make_env(
     ``functools.partial(make_env, ...)`` can be pickled and sent to worker processes.
 
     Args:
-        task: ``"block_picking"``, ``"clutter_grasping"``, ``"block_pushing"`` or
-            ``"block_in_bowl"``.
+        task: ``"block_picking"``, ``"clutter_grasping"``, ``"block_pushing"``,
+            ``"block_in_bowl"``, or one of your own: its class, or ``"package.module:Class"``.
         image_size: pixels along a side of the depth image, even.
         seed: seed of the first episode, as given to ``set_seed``.
         robot: ``"panda"``: the arm, as in the paper; ``"hand"``: its hand alone, free: faster,
@@ -64,6 +67,29 @@ def make_env(
         time_limit=time_limit,
         workspace=Workspace(),
     )
+
+
+def make_expert(env: EnvBase, **options: str) -> Expert:
+    """Returns the planner for the task of ``env``.
+
+    Args:
+        env: the `ManipulationEnv` it reads and acts in, wrapped in transforms or not.
+        options: ``horizontal_clip``, how a displacement in x and y is limited to one action:
+            ``"norm"``, the default, keeps its direction, so that (x, y) lies in the unit disc;
+            ``"box"`` clips each component, as in the paper. And what the planner of the task
+            offers (its ``CHOICES``): that of Clutter Grasping ``grasp``, which is ``"random"``,
+            whatever the object's orientation, as in the paper, or ``"aligned"``, where least is
+            in the way of the fingers.
+
+    Raises:
+        ValueError: if there is no planner for the task, or on another option or value.
+    """
+    base = getattr(env, "base_env", env)
+    if not isinstance(base, ManipulationEnv):
+        raise ValueError(f"experts act in a ManipulationEnv, got {type(base).__name__}")
+    if base.task.expert is None:
+        raise ValueError(f"{type(base.task).__name__} has no expert: its property 'expert' is None")
+    return base.task.expert(base, **options)
 
 
 def _is_int(value: object) -> bool:

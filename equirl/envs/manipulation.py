@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from numbers import Integral
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -63,7 +63,7 @@ class ManipulationEnv(EnvBase):
         seed: int,
         robot: str,
         max_steps: int,
-        time_limit: Literal["truncate", "terminate"],
+        time_limit: str,
         workspace: Workspace,
     ):
         super().__init__(device=None, batch_size=torch.Size([]))

@@ -12,13 +12,11 @@ from typing import Any
 
 import torch
 
+from equirl.config import is_free
+
 __all__ = ["CheckpointError", "check_same_config", "load_checkpoint", "save_checkpoint"]
 
 _FORMAT = 2
-
-#: Keys that may change when a run is resumed: none touches what has been learned.
-_FREE_KEYS = ("steps", "device", "threads", "backend", "checkpoint_every")
-_FREE_GROUPS = ("logging.", "evaluation.")
 
 
 class CheckpointError(RuntimeError):
@@ -77,7 +75,7 @@ def check_same_config(config: dict[str, Any], stored: dict[str, Any], where: Pat
     different = [
         f"{key} is {stored.get(key)} there and {value} here"
         for key, value in config.items()
-        if stored.get(key) != value and key not in _FREE_KEYS and not key.startswith(_FREE_GROUPS)
+        if stored.get(key) != value and not is_free(key)
     ]
     if different:
         raise CheckpointError(

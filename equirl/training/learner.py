@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -149,7 +150,7 @@ def load_policy(
         CheckpointError: It holds no readable checkpoint of that configuration.
     """
     config = load_run_config(folder)
-    config.device, config.backend = device or config.device, backend or config.backend
+    config = replace(config, device=device or config.device, backend=backend or config.backend)
     state = load_checkpoint(folder / CHECKPOINT)
     check_same_config(flatten(config), state["config"], folder / CHECKPOINT)
     learner = Learner(config)

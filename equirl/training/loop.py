@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any
 
 import torch
 from tqdm import tqdm
@@ -17,7 +17,7 @@ from equirl.collectors import DemonstrationCollector, Episode, OnlineCollector
 from equirl.config import Config, flatten
 from equirl.data import load_replay_state, make_replay_buffer, replay_state
 from equirl.envs import ManipulationEnv, make_env, make_expert
-from equirl.envs.tasks import TASKS
+from equirl.envs.tasks import find_task
 from equirl.modules import shared_filters
 
 from .checkpoint import CheckpointError, check_same_config, load_checkpoint, save_checkpoint
@@ -40,11 +40,11 @@ def make_run_env(config: Config, **options: Any) -> ManipulationEnv:
     ``paper`` mode stores time-outs as terminal and judges as the paper's implementation does.
     """
     paper = config.mode == "paper"
-    defaults = TASKS[config.env.task].paper_options if paper else {}
+    defaults = find_task(config.env.task).paper_options if paper else {}
     return make_env(
         config.env.task,
         image_size=config.env.image_size,
-        robot=cast(Literal["panda", "hand"], config.env.robot),
+        robot=config.env.robot,
         max_steps=config.env.max_steps,
         time_limit="terminate" if paper else "truncate",
         **{**defaults, **config.env.options, **options},
@@ -125,11 +125,10 @@ class TrainingRun:
     def _collect_demonstrations(self) -> None:
         if self.config.demos.episodes == 0:
             return
-        clip: Literal["box", "norm"] = "box" if self.config.mode == "paper" else "norm"
-        grasp = cast(Literal["random", "aligned"], self.config.demos.grasp)
+        clip = {"horizontal_clip": "box" if self.config.mode == "paper" else "norm"}
         demonstrations = DemonstrationCollector(
             self.env,
-            make_expert(self.env, horizontal_clip=clip, grasp=grasp),
+            make_expert(self.env, **clip | self.config.demos.options),
             episodes=self.config.demos.episodes,
             seeds=partial(scene_seed, self.config.seed, Purpose.DEMONSTRATIONS),
             replay_buffer=self.buffer,

@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from equirl.envs import Scene
 from equirl.envs.bullet import Simulation
-from equirl.envs.tasks import BlockInBowl
-from equirl.envs.tasks.block_in_bowl import tilt
+from equirl.envs.tasks.block_in_bowl import BlockInBowl, tilt
 from equirl.envs.workspace import Workspace
 
 TASK = BlockInBowl()

@@ -143,7 +143,10 @@ def test_bad_arguments_are_refused():
     env = make_env("block_picking", image_size=8)
     with pytest.raises(ValueError, match="'norm' or 'box', got 'disc'"):
         make_expert(env, horizontal_clip="disc")
+    with pytest.raises(ValueError, match="BlockPickingExpert has no option grasp"):
+        make_expert(env, grasp="aligned")
+    clutter = make_env("clutter_grasping", image_size=8)
     with pytest.raises(ValueError, match="'random' or 'aligned', got 'best'"):
-        make_expert(env, grasp="best")
+        make_expert(clutter, grasp="best")
     with pytest.raises(ValueError, match="ManipulationEnv, got str"):
         make_expert("block_picking")

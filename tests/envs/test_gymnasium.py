@@ -151,10 +151,10 @@ def test_impossible_actions_are_refused_with_their_values(env, action):
     ("arguments", "message"),
     [
         ({"render_mode": "ascii"}, r"render_mode must be None or one of \['rgb_array'\], got 'as"),
-        ({"task": "block_stacking"}, "unknown task 'block_stacking'; known tasks: .*block_picking"),
+        ({"task": "block_stacking"}, "unknown task 'block_stacking'; expected .*block_picking"),
         ({"image_size": 65}, "image_size must be an even positive integer, got 65"),
         ({"seed": -1}, "seed must be a non-negative integer, got -1"),
-        ({"colour": "red"}, "block_picking has no option colour"),
+        ({"colour": "red"}, "BlockPicking has no option colour"),
     ],
 )
 def test_arguments_are_validated(arguments, message):

@@ -210,7 +210,7 @@ def test_simulated_images_turn_with_the_scene(robot):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"task": "block_stacking"}, "unknown task 'block_stacking'; known tasks: .*block_picking"),
+        ({"task": "block_stacking"}, "unknown task 'block_stacking'; expected .*block_picking"),
         ({"image_size": 65}, "image_size must be an even positive integer, got 65"),
         ({"image_size": 0}, "image_size must be .* got 0"),
         ({"seed": -1}, "seed must be a non-negative integer, got -1"),

@@ -11,14 +11,10 @@ from torchrl.envs.utils import check_env_specs
 
 from equirl.envs import PlacementError, Scene, make_env
 from equirl.envs.objects import Body, ConvexPolyhedron, ObjectSet
-from equirl.envs.tasks import (
-    TASKS,
-    BlockInBowl,
-    BlockPushing,
-    ClutterGrasping,
-    State,
-    make_task,
-)
+from equirl.envs.tasks import TASKS, State, make_task
+from equirl.envs.tasks.block_in_bowl import BlockInBowl
+from equirl.envs.tasks.block_pushing import BlockPushing
+from equirl.envs.tasks.clutter_grasping import ClutterGrasping
 
 HOME = Scene([0, 0, 0.2], 0.0, 0.08, [])
 REST = (0, 0, 0, 1)
@@ -233,7 +229,7 @@ def test_every_number_can_be_set():
         (
             "block_picking",
             {"lift": 0.1},
-            "block_picking has no option lift; its options: .*lift_hei",
+            "BlockPicking has no option lift; its options: .*lift_hei",
         ),
         ("block_picking", {"cube_side": 0}, "cube_side must be a finite number above 0, got 0"),
         ("block_picking", {"view": float("nan")}, "view must be .* got nan"),

@@ -75,7 +75,7 @@ def test_an_impossible_scene_ends_in_one_sentence(tmp_path):
     code, _, err = call("train.py", *SMOKE, *arguments)
     assert code == 1 and "no place in 20000 tries for a goal" in err and "Traceback" not in err
     code, _, err = call("train.py", *SMOKE, "env=block_pushing", "env.options.goal_sides=0.1")
-    assert code == 1 and "env.options: block_pushing has no option goal_sides" in err
+    assert code == 1 and "env.options: BlockPushing has no option goal_sides" in err
 
 
 def test_evaluation_of_a_finished_run(finished, tmp_path):

@@ -111,7 +111,7 @@ def test_the_policy_of_a_run_in_its_own_environment(watch, tmp_path, monkeypatch
         (["policy=exprt"], "policy=exprt: expected expert, random or the folder of a run"),
         (["colour=red"], "colour"),
         (["env=block_stacking"], "block_stacking"),
-        (["env.options.colour=red"], "block_picking has no option colour"),
+        (["env.options.colour=red"], "BlockPicking has no option colour"),
         (["env.max_steps=0"], "env.max_steps=0: expected 1 or more"),
         (["env.image_size=7"], "env.image_size=7: expected an even number"),
         (["episodes=0"], "episodes=0: expected 1 or more"),

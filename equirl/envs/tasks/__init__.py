@@ -1,53 +1,89 @@
-"""The tasks, by name."""
+"""The tasks: a file of this folder each, which says all there is to say about one."""
 
 from __future__ import annotations
 
+import pkgutil
 from dataclasses import fields
+from importlib import import_module
+from inspect import getmembers, isabstract, isclass
 from typing import Any
 
-from equirl.envs.tasks.base import PlacementError, State, Task
-from equirl.envs.tasks.block_in_bowl import BlockInBowl
-from equirl.envs.tasks.block_picking import BlockPicking
-from equirl.envs.tasks.block_pushing import BlockPushing
-from equirl.envs.tasks.clutter_grasping import ClutterGrasping
-
-TASKS: dict[str, type[Task]] = {
-    "block_picking": BlockPicking,
-    "clutter_grasping": ClutterGrasping,
-    "block_pushing": BlockPushing,
-    "block_in_bowl": BlockInBowl,
-}
+from equirl.envs.tasks.base import PlacementError, State, Task, lying, rejection_sample
+from equirl.envs.tasks.block_task import BlockTask
 
 __all__ = [
     "TASKS",
-    "BlockInBowl",
-    "BlockPicking",
-    "BlockPushing",
-    "ClutterGrasping",
+    "BlockTask",
     "PlacementError",
     "State",
     "Task",
+    "find_task",
+    "lying",
     "make_task",
+    "rejection_sample",
 ]
 
 
-def make_task(name: str, **options: Any) -> Task:
-    """Returns the task called ``name``.
+def _task_of(module: str) -> type[Task] | None:
+    """Returns the task a module defines; None if it holds what tasks share."""
+    tasks = [
+        each
+        for _, each in getmembers(import_module(module), isclass)
+        if issubclass(each, Task) and each.__module__ == module and not isabstract(each)
+    ]
+    return tasks[0] if tasks else None
+
+
+#: The tasks of this folder, by the names of their files.
+TASKS: dict[str, type[Task]] = {
+    entry.name: task
+    for entry in pkgutil.iter_modules(__path__)
+    if (task := _task_of(f"{__name__}.{entry.name}"))
+}
+
+
+def find_task(name: str | type[Task]) -> type[Task]:
+    """Returns the class of a task.
 
     Args:
-        name: a key of `TASKS`.
+        name: one of `TASKS`, ``"package.module:Class"`` for a task defined elsewhere, or the class
+            itself.
+
+    Raises:
+        ValueError: if there is no such task.
+    """
+    task: Any = TASKS.get(name, name) if isinstance(name, str) else name
+    if isinstance(task, str):
+        module, colon, attribute = task.partition(":")
+        if not colon:
+            raise ValueError(
+                f"unknown task {name!r}; expected {', '.join(TASKS)} or 'package.module:Class'"
+            )
+        try:
+            task = getattr(import_module(module), attribute)
+        except (ImportError, AttributeError, ValueError) as error:
+            raise ValueError(f"task {name!r} cannot be imported: {error}") from None
+    if not (isclass(task) and issubclass(task, Task)):
+        raise ValueError(f"a task must be a subclass of {Task.__module__}.Task, got {task!r}")
+    return task
+
+
+def make_task(task: str | type[Task], **options: Any) -> Task:
+    """Returns a task with numbers of one's own.
+
+    Args:
+        task: as for `find_task`.
         options: numbers of the task, by the names of its attributes.
 
     Raises:
         ValueError: if there is none, or it has no such option or not such a value; the message
             lists the names.
     """
-    if name not in TASKS:
-        raise ValueError(f"unknown task {name!r}; known tasks: {', '.join(sorted(TASKS))}")
-    known = sorted(each.name for each in fields(TASKS[name]))
+    kind = find_task(task)
+    known = sorted(each.name for each in fields(kind))
     unknown = sorted(set(options) - set(known))
     if unknown:
         raise ValueError(
-            f"{name} has no option {', '.join(unknown)}; its options: {', '.join(known)}"
+            f"{kind.__name__} has no option {', '.join(unknown)}; its options: {', '.join(known)}"
         )
-    return TASKS[name](**options)
+    return kind(**options)

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from equirl.envs.expert import Expert
 from equirl.envs.objects import Body, ObjectSet
 from equirl.envs.scene import Area, Scene
 from equirl.envs.workspace import Workspace
@@ -39,7 +40,7 @@ class State:
 
 @dataclass(frozen=True, kw_only=True)
 class Task(ABC):
-    """A task: which bodies there are, where they start, what success is.
+    """A task: which bodies there are, where they start, what success is, who can show it.
 
     The fields of a task are its numbers (m, kg, rad), checked at construction.
 
@@ -90,6 +91,11 @@ class Task(ABC):
     @abstractmethod
     def succeeded(self, state: State) -> bool:
         """Judges the state at the end of a step."""
+
+    @property
+    def expert(self) -> type[Expert] | None:
+        """The task's scripted planner, if it has one."""
+        return None
 
     def continued(self, state: State, succeeded: bool, episodes: int) -> Scene | None:
         """Returns what the next episode of the same scene starts with.

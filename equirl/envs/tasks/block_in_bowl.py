@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from equirl.envs.expert import CLOSED, NARROW, OPEN, Expert, box_yaw, nearest_symmetric_yaw
 from equirl.envs.objects import Body, ObjectSet, bowl
 from equirl.envs.scene import Scene
 from equirl.envs.tasks.base import State, lying
@@ -73,6 +74,11 @@ class BlockInBowl(BlockTask):
         """The cube and the bowl."""
         return ObjectSet([self.cube, self.bowl], "Block in Bowl")
 
+    @property
+    def expert(self) -> type[Expert]:
+        """Its planner."""
+        return BlockInBowlExpert
+
     def sample(self, rng: np.random.Generator, home: Scene) -> Scene:
         """Draws the cube's x, y and yaw and the bowl's x and y."""
         cube, where = self.sample_apart(rng, self.bowl_half_width, self.bowl_distance, "a bowl")
@@ -85,6 +91,37 @@ class BlockInBowl(BlockTask):
             return False
         inside = np.hypot(*(cube[:2] - bowl[:2])) < self.reach
         return bool(inside and tilt(bowl[3:]) < self.max_tilt and state.touching(0, 1))
+
+
+class BlockInBowlExpert(Expert):
+    """Stateless: the way-point follows from the state, so what fails is tried again."""
+
+    _above = 0.10  # m over the cube, and over the bowl
+    _near = 0.012  # m, what counts as being at a way-point
+    _over_bowl = 0.03  # m, where the cube would fall into it
+
+    def plan(self, scene: Scene, held: int | None) -> np.ndarray:
+        """Returns the action for a state, shape (5,)."""
+        cube, bowl = scene.objects
+        if held == 0:
+            return self._carry(scene, bowl)
+        inside = np.hypot(*(cube[:2] - bowl[:2])) < self._over_bowl
+        if scene.aperture < NARROW or inside:
+            return np.array([OPEN, 0.0, 0.0, 1.0, 0.0])
+        yaw = nearest_symmetric_yaw(box_yaw(cube[3:]), scene.yaw, np.pi / 2)
+        apart = np.hypot(*(scene.position[:2] - cube[:2]))
+        if apart < self._near and abs(scene.yaw - yaw) < 0.1:
+            return self.toward(scene, cube[:3], yaw, gripper=OPEN, arrived=CLOSED)
+        above = cube[:3] + (0, 0, self._above)
+        return self.toward(scene, above, yaw, gripper=OPEN, arrived=OPEN)
+
+    def _carry(self, scene: Scene, bowl: np.ndarray) -> np.ndarray:
+        above = bowl[:3] + (0, 0, self._above)
+        low = scene.position[2] < above[2] - self._near
+        if low and np.hypot(*(scene.position[:2] - above[:2])) > self._over_bowl:
+            above[:2] = scene.position[:2]  # first up, then across
+            return self.toward(scene, above, scene.yaw, gripper=CLOSED, arrived=CLOSED)
+        return self.toward(scene, above, scene.yaw, gripper=CLOSED, arrived=OPEN)
 
 
 def tilt(quaternion: np.ndarray) -> float:

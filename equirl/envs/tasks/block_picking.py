@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from equirl.envs.expert import CLOSED, NARROW, OPEN, Expert, box_yaw, nearest_symmetric_yaw
 from equirl.envs.objects import ObjectSet
 from equirl.envs.scene import Scene
 from equirl.envs.tasks.base import WORKSPACE, State, lying
@@ -33,6 +34,11 @@ class BlockPicking(BlockTask):
         """The cube."""
         return ObjectSet([self.cube], "Block Picking")
 
+    @property
+    def expert(self) -> type[Expert]:
+        """Its planner."""
+        return BlockPickingExpert
+
     def sample(self, rng: np.random.Generator, home: Scene) -> Scene:
         """Draws the cube's x, y and yaw."""
         wide = np.array(self.start_range)
@@ -42,3 +48,18 @@ class BlockPicking(BlockTask):
     def succeeded(self, state: State) -> bool:
         """Tells whether the cube is held high enough."""
         return state.held is not None and state.scene.position[2] > self.lift_height
+
+
+class BlockPickingExpert(Expert):
+    """Stateless: the way-point follows from the state, so a failed grasp is tried again."""
+
+    def plan(self, scene: Scene, held: int | None) -> np.ndarray:
+        """Returns the action for a state, shape (5,)."""
+        cube = scene.objects[0]
+        if held is not None:
+            return np.array([CLOSED, 0.0, 0.0, 1.0, 0.0])
+        if scene.aperture < NARROW:
+            return np.array([OPEN, 0.0, 0.0, 1.0, 0.0])
+        # A quarter turn leaves the cube as it is (and a half turn the gripper).
+        yaw = nearest_symmetric_yaw(box_yaw(cube[3:]), scene.yaw, np.pi / 2)
+        return self.toward(scene, cube[:3], yaw, gripper=OPEN, arrived=CLOSED)
