@@ -285,7 +285,7 @@ def is_free(key: str) -> bool:
     """Whether a run may be resumed with another value: the key does not touch what is learned.
 
     Args:
-        key: A key of :class:`Config`, ``"env.task"``, or a group of them, ``"env"``.
+        key: A key of `Config`, ``"env.task"``, or a group of them, ``"env"``.
     """
     known = {entry.name: entry.metadata.get("free", False) for entry in fields(Config)}
     return known.get(key.partition(".")[0], False)
@@ -297,6 +297,9 @@ def to_config(values: Any, schema: type[Job] = Config) -> Job:  # type: ignore[a
     Raises:
         ConfigError: An unknown key, a value of the wrong type or out of range; named.
     """
+    if OmegaConf.is_config(values):
+        # A plain mapping: what Hydra composed may hold keys that were forced upon it (`+key=1`).
+        values = OmegaConf.to_container(values, resolve=True)
     try:
         merged = OmegaConf.merge(OmegaConf.structured(schema), values)
         config = cast(Job, OmegaConf.to_object(merged))
@@ -319,7 +322,7 @@ def write_atomically(path: Path, text: str) -> None:
 
 
 def load_config(path: Path) -> Config:
-    """Reads a configuration that :func:`save_config` wrote.
+    """Reads a configuration that `save_config` wrote.
 
     Raises:
         ConfigError: The file is not one.

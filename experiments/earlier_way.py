@@ -39,9 +39,9 @@ class EarlierWay:
     """The cell of a task, simulated and seen the earlier way.
 
     Args:
-        task: what is in it.
+        task: What is in it.
         image_size: S, pixels along a side of the depth image.
-        camera_size: pixels along a side of the two pictures it is merged from.
+        camera_size: Pixels along a side of the two pictures it is merged from.
     """
 
     def __init__(self, task: Task, image_size: int = 128, camera_size: int = 512):

@@ -141,7 +141,7 @@ class TextbookSAC:
     An update encodes five times: the next state by the actor and by the target critic and,
     for the actor's loss, the state by the critic, without gradients in the encoder; the
     state by the critic and by the actor with gradients. Same losses, in the same order of
-    random draws, as :class:`equirl.training.Learner`.
+    random draws, as `Learner`.
 
     Args:
         policy: Maps depth and flag to mean and deviation.

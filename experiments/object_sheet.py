@@ -54,13 +54,13 @@ def draw_objects(objects: ObjectSet, path: Path, columns: int = 12, size: int = 
     """Writes a PNG file with a picture of each object above its name.
 
     Args:
-        objects: what to draw.
-        path: the file.
-        columns: objects in a row.
-        size: pixels a side of each picture.
+        objects: What to draw.
+        path: The file.
+        columns: Objects in a row.
+        size: Pixels a side of each picture.
 
     Raises:
-        OSError: the file cannot be written.
+        OSError: The file cannot be written.
     """
     from matplotlib.figure import Figure
 

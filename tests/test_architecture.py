@@ -35,7 +35,7 @@ CONFINED = {
     "gymnasium": "envs/gymnasium.py",
     "trimesh": "envs/objects/convex_pieces.py",
     "coacd": "envs/objects/convex_pieces.py",
-    "tqdm": "training/loop.py",
+    "tqdm": "training/progress.py",
 }
 
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .statistics import moving_return
-from .tables import read_table
+from equirl.analysis.statistics import moving_return
+from equirl.analysis.tables import read_table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

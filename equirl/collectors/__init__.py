@@ -1,6 +1,6 @@
 """Collectors of experience."""
 
-from .demonstrations import DemonstrationCollector, DemonstrationError
-from .online import Episode, OnlineCollector
+from equirl.collectors.demonstrations import DemonstrationCollector, DemonstrationError
+from equirl.collectors.online import Episode, OnlineCollector
 
 __all__ = ["DemonstrationCollector", "DemonstrationError", "Episode", "OnlineCollector"]

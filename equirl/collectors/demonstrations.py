@@ -12,9 +12,10 @@ from torchrl.collectors import BaseCollector
 from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
 
+from equirl.collectors.scene_log import SceneLog
 from equirl.data import TRANSITION_KEYS
 
-from .scene_log import SceneLog
+__all__ = ["DemonstrationCollector", "DemonstrationError"]
 
 
 class DemonstrationError(RuntimeError):
@@ -38,22 +39,22 @@ class DemonstrationCollector(BaseCollector):
         ...     buffer.extend(episode)
 
     Args:
-        env: where to act; not batched.
-        policy: writes ``action``. Defaults to ``equirl.envs.make_expert(env)``.
-        episodes: how many successful episodes to yield in all.
-        seed: root of all randomness.
-        seeds: maps the number of an attempt to the seed of its scene, instead of ``seed``; for
+        env: Where to act; not batched.
+        policy: Writes ``action``. Defaults to ``equirl.envs.make_expert(env)``.
+        episodes: How many successful episodes to yield in all.
+        seed: Root of all randomness.
+        seeds: Maps the number of an attempt to the seed of its scene, instead of ``seed``; for
             callers that keep the scenes of several purposes apart.
-        replay_buffer: if given, every episode is also written into it by one ``extend``.
-        max_failures: consecutive failed attempts that are given up on.
+        replay_buffer: If given, every episode is also written into it by one ``extend``.
+        max_failures: Consecutive failed attempts that are given up on.
 
     Attributes:
-        attempted: episodes tried so far.
-        episodes_collected: successful episodes so far.
+        attempted: Episodes tried so far.
+        episodes_collected: Successful episodes so far.
 
     Raises:
-        ValueError: on an argument out of range.
-        DemonstrationError: while iterating, after ``max_failures`` failed attempts in a row.
+        ValueError: On an argument out of range.
+        DemonstrationError: While iterating, after ``max_failures`` failed attempts in a row.
     """
 
     def __init__(

@@ -12,9 +12,8 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
+from equirl.collectors.scene_log import SceneLog
 from equirl.data import TRANSITION_KEYS
-
-from .scene_log import SceneLog
 
 __all__ = ["Episode", "OnlineCollector"]
 
@@ -78,11 +77,11 @@ class OnlineCollector:
         """Takes the chosen action.
 
         Args:
-            acted: What :meth:`act` returned.
+            acted: What `act` returned.
 
         Returns:
             The transition, of batch size (1,) and the keys of
-            :data:`~equirl.data.TRANSITION_KEYS`, and the episode's summary if it ended.
+            `TRANSITION_KEYS`, and the episode's summary if it ended.
         """
         assert self._current is not None
         taken = self._current.copy().set("action", acted["action"].detach().cpu())

@@ -9,6 +9,8 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
+__all__ = ["SceneLog"]
+
 
 class SceneLog:
     """Begins the episodes of one environment and remembers the actions since its scene began.
@@ -18,8 +20,8 @@ class SceneLog:
     A simulator's state cannot be copied exactly, so it is rebuilt: from the seed, by the actions.
 
     Args:
-        env: a single environment (batch size ``()``).
-        seeds: maps the number of an episode to the seed of its scene.
+        env: A single environment (batch size ``()``).
+        seeds: Maps the number of an episode to the seed of its scene.
     """
 
     def __init__(self, env: EnvBase, seeds: Callable[[int], int]):
@@ -36,7 +38,7 @@ class SceneLog:
         """Returns the first observation of an episode, on the present scene if that continues.
 
         Args:
-            episode: its number.
+            episode: Its number.
         """
         if self._first is None or not getattr(self.env, "scene_continues", False):
             self.env.set_seed(self.seeds(episode), static_seed=True)
@@ -65,7 +67,7 @@ class SceneLog:
             The steps of its last episode, as `step` returned them.
 
         Raises:
-            RuntimeError: if the scene does not go on as it did, in another simulator perhaps.
+            RuntimeError: If the scene does not go on as it did, in another simulator perhaps.
         """
         self.forget()
         steps: list[TensorDictBase] = []

@@ -1,8 +1,8 @@
 """Replay buffers and the transforms between insertion and sampling."""
 
-from .keys import TRANSITION_KEYS
-from .replay import load_replay_state, make_replay_buffer, replay_state
-from .transforms import QuantizeDepth, RotationAugmentation
+from equirl.data.keys import TRANSITION_KEYS
+from equirl.data.replay import load_replay_state, make_replay_buffer, replay_state
+from equirl.data.transforms import QuantizeDepth, RotationAugmentation
 
 __all__ = [
     "TRANSITION_KEYS",

@@ -10,7 +10,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import RandomSampler
 from torchrl.envs import Compose
 
-from .transforms import QuantizeDepth, RotationAugmentation
+from equirl.data.transforms import QuantizeDepth, RotationAugmentation
 
 __all__ = ["load_replay_state", "make_replay_buffer", "replay_state"]
 
@@ -37,7 +37,7 @@ def make_replay_buffer(
 
     Returns:
         A buffer to ``extend`` with tensordicts of the keys in
-        :data:`~equirl.data.TRANSITION_KEYS`; always ``extend``, since ``add`` bypasses
+        `TRANSITION_KEYS`; always ``extend``, since ``add`` bypasses
         transforms.
 
     Raises:
@@ -73,7 +73,7 @@ def replay_state(buffer: TensorDictReplayBuffer) -> dict[str, Any]:
 
 
 def load_replay_state(buffer: TensorDictReplayBuffer, state: dict[str, Any]) -> None:
-    """Fills an empty buffer with what :func:`replay_state` kept."""
+    """Fills an empty buffer with what `replay_state` kept."""
     if state["size"]:
         rows = TensorDict(state["rows"], batch_size=[state["size"]])
         buffer.storage.set(torch.arange(state["size"]), rows)

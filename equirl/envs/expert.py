@@ -17,6 +17,8 @@ from equirl.envs.scene import Scene
 if TYPE_CHECKING:
     from equirl.envs.manipulation import ManipulationEnv
 
+__all__ = ["CLOSED", "HALF_OPEN", "NARROW", "OPEN", "Expert", "box_yaw", "nearest_symmetric_yaw"]
+
 OPEN, HALF_OPEN, CLOSED = 1.0, 0.0, -1.0
 # A gripper narrower than this (m) has not come to grasp: the diagonal of the 5 cm cube is 0.071 m.
 NARROW = 0.072
@@ -29,11 +31,11 @@ class Expert(TensorDictModuleBase):
     `equirl.envs.make_expert`.
 
     Args:
-        env: the environment it acts in.
-        options: a value for any of the names in `CHOICES`.
+        env: The environment it acts in.
+        options: A value for any of the names in `CHOICES`.
 
     Raises:
-        ValueError: on another name or value.
+        ValueError: On another name or value.
     """
 
     #: What can be chosen, by name: the values, the default first. ``horizontal_clip`` is how a
@@ -55,7 +57,7 @@ class Expert(TensorDictModuleBase):
         """Returns a value for every name in `CHOICES`: the option's, or the default.
 
         Raises:
-            ValueError: on a name or value that is not among them.
+            ValueError: On a name or value that is not among them.
         """
         for name, value in options.items():
             if name not in cls.CHOICES:
@@ -94,11 +96,11 @@ class Expert(TensorDictModuleBase):
         """Returns the action that goes to a way-point as far as one action can.
 
         Args:
-            scene: the present state.
-            position: the way-point, shape (3,), m.
-            yaw: yaw at the way-point, rad.
-            gripper: gripper component on the way.
-            arrived: gripper component of the action that lands on the way-point.
+            scene: The present state.
+            position: The way-point, shape (3,), m.
+            yaw: Yaw at the way-point, rad.
+            gripper: Gripper component on the way.
+            arrived: Gripper component of the action that lands on the way-point.
 
         Returns:
             The action, shape (5,).

@@ -12,6 +12,8 @@ from equirl.envs.manipulation import ManipulationEnv
 from equirl.envs.tasks import Task, make_task
 from equirl.envs.workspace import Workspace
 
+__all__ = ["make_env", "make_expert"]
+
 
 def make_env(
     task: str | type[Task],
@@ -30,18 +32,18 @@ def make_env(
     Args:
         task: ``"block_picking"``, ``"clutter_grasping"``, ``"block_pushing"``,
             ``"block_in_bowl"``, or one of your own: its class, or ``"package.module:Class"``.
-        image_size: pixels along a side of the depth image, even.
-        seed: seed of the first episode, as given to ``set_seed``.
+        image_size: Pixels along a side of the depth image, even.
+        seed: Seed of the first episode, as given to ``set_seed``.
         robot: ``"panda"``: the arm, as in the paper; ``"hand"``: its hand alone, free: faster,
             and its motion commutes with turns of the scene.
-        max_steps: length of an episode without success.
-        time_limit: what the last of ``max_steps`` steps is: ``"truncate"`` (its value is
+        max_steps: Length of an episode without success.
+        time_limit: What the last of ``max_steps`` steps is: ``"truncate"`` (its value is
             bootstrapped) or ``"terminate"`` (as the paper's own implementation stores it).
-        options: numbers of the task, for example ``lift_height=0.12``; see the classes in
+        options: Numbers of the task, for example ``lift_height=0.12``; see the classes in
             `equirl.envs.tasks`.
 
     Raises:
-        ValueError: if an argument is not one of these.
+        ValueError: If an argument is not one of these.
     """
     _require(
         _is_int(image_size) and image_size > 0 and image_size % 2 == 0,
@@ -73,7 +75,7 @@ def make_expert(env: EnvBase, **options: str) -> Expert:
     """Returns the planner for the task of ``env``.
 
     Args:
-        env: the `ManipulationEnv` it reads and acts in, wrapped in transforms or not.
+        env: The `ManipulationEnv` it reads and acts in, wrapped in transforms or not.
         options: ``horizontal_clip``, how a displacement in x and y is limited to one action:
             ``"norm"``, the default, keeps its direction, so that (x, y) lies in the unit disc;
             ``"box"`` clips each component, as in the paper. And what the planner of the task
@@ -82,7 +84,7 @@ def make_expert(env: EnvBase, **options: str) -> Expert:
             in the way of the fingers.
 
     Raises:
-        ValueError: if there is no planner for the task, or on another option or value.
+        ValueError: If there is no planner for the task, or on another option or value.
     """
     base = getattr(env, "base_env", env)
     if not isinstance(base, ManipulationEnv):

@@ -45,19 +45,19 @@ class GymnasiumEnv(gymnasium.Env[Observation, np.ndarray]):
     The environment ends an episode after ``max_steps`` by itself; it needs no ``TimeLimit``.
 
     Args:
-        task: as for `equirl.envs.make_env`.
-        seed: what the first reset without a seed is seeded with. None, as Gymnasium's users
+        task: As for `equirl.envs.make_env`.
+        seed: What the first reset without a seed is seeded with. None, as Gymnasium's users
             expect: drawn from ``np_random``, so that each environment differs; ``np_random_seed``
             tells it afterwards, for a repetition.
         render_mode: ``"rgb_array"`` if `render` is to return pictures, or None.
-        options: further arguments of `equirl.envs.make_env`: ``image_size``, ``robot``,
+        options: Further arguments of `equirl.envs.make_env`: ``image_size``, ``robot``,
             ``max_steps``, ``time_limit`` and the numbers of the task.
 
     Attributes:
-        env: the `ManipulationEnv`, for experts, scenes and pictures of any size.
+        env: The `ManipulationEnv`, for experts, scenes and pictures of any size.
 
     Raises:
-        ValueError: if an argument is not one of these.
+        ValueError: If an argument is not one of these.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 4}
@@ -88,15 +88,15 @@ class GymnasiumEnv(gymnasium.Env[Observation, np.ndarray]):
         """Starts an episode.
 
         Args:
-            seed: starts over as ``ManipulationEnv.set_seed(seed)`` does. Without it, the episodes
+            seed: Starts over as ``ManipulationEnv.set_seed(seed)`` does. Without it, the episodes
                 go on in the order that the last seed determines.
-            options: none are known; ignored.
+            options: None are known; ignored.
 
         Returns:
             The observation and the info.
 
         Raises:
-            RuntimeError: if the environment is closed.
+            RuntimeError: If the environment is closed.
         """
         if seed is None and not self._seeded:
             seed = self._first_seed
@@ -114,15 +114,15 @@ class GymnasiumEnv(gymnasium.Env[Observation, np.ndarray]):
         """Acts once.
 
         Args:
-            action: shape (5,), order (gripper, x, y, z, theta), in [-1, 1].
+            action: Shape (5,), order (gripper, x, y, z, theta), in [-1, 1].
 
         Returns:
             The observation, the reward, whether the episode is terminated, whether it is
             truncated, and the info.
 
         Raises:
-            ValueError: if the action has another shape or leaves [-1, 1].
-            RuntimeError: before the first reset.
+            ValueError: If the action has another shape or leaves [-1, 1].
+            RuntimeError: Before the first reset.
         """
         values = torch.tensor(np.asarray(action, dtype=np.float32))
         after = self.env.step(TensorDict({"action": values}))["next"]

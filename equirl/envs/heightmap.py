@@ -21,6 +21,8 @@ from equirl.envs.objects import ObjectSet
 from equirl.envs.scene import Area, Scene
 from equirl.envs.workspace import Workspace
 
+__all__ = ["Heightmap", "HeightmapSpec", "View"]
+
 # Closed coverage tests allow this much (m), so that no seam opens between two triangles.
 _EDGE_TOLERANCE = 1e-9
 
@@ -31,12 +33,12 @@ class HeightmapSpec:
 
     Attributes:
         size: S, pixels along a side.
-        side: length of a side, m.
-        max_depth: depths are clipped to [0, max_depth], m.
-        clearance: surfaces above the end effector height minus this are clamped to it (m) ...
+        side: Length of a side, m.
+        max_depth: Depths are clipped to [0, max_depth], m.
+        clearance: Surfaces above the end effector height minus this are clamped to it (m) ...
         min_ceiling: ... unless that is below this height (m).
-        finger_length: side of a drawn finger along the finger axis, m.
-        finger_width: side of a drawn finger across the finger axis, m.
+        finger_length: Side of a drawn finger along the finger axis, m.
+        finger_width: Side of a drawn finger across the finger axis, m.
     """
 
     size: int
@@ -53,12 +55,12 @@ class View:
     """A scene reduced to what is drawn, free of trigonometry.
 
     Attributes:
-        vertices: of all bodies, relative to the end effector's x and y, shape (V, 3), m.
-        triangles: rows of three vertex indices, shape (T, 3).
-        position: end effector position, shape (3,), m.
-        finger_axis: unit vector along the finger axis in the plane, shape (2,).
-        aperture: distance between the fingers, m.
-        areas: one row (x, y, axis x, axis y) a marked square: its centre relative to the end
+        vertices: Of all bodies, relative to the end effector's x and y, shape (V, 3), m.
+        triangles: Rows of three vertex indices, shape (T, 3).
+        position: End effector position, shape (3,), m.
+        finger_axis: Unit vector along the finger axis in the plane, shape (2,).
+        aperture: Distance between the fingers, m.
+        areas: One row (x, y, axis x, axis y) a marked square: its centre relative to the end
             effector, m, and the direction of a side, shape (M, 4).
     """
 
@@ -74,10 +76,10 @@ class Heightmap:
     """Draws scenes.
 
     Args:
-        bodies: what scenes are made of, by name.
-        spec: what the picture shows.
-        workspace: where the bin is.
-        areas: the squares to mark, in the order of `Scene.areas`.
+        bodies: What scenes are made of, by name.
+        spec: What the picture shows.
+        workspace: Where the bin is.
+        areas: The squares to mark, in the order of `Scene.areas`.
     """
 
     def __init__(

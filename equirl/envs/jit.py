@@ -7,6 +7,8 @@ from typing import Any
 
 import numba
 
+__all__ = ["compiled"]
+
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compiles ``function`` at its first call and keeps the machine code between processes.

@@ -18,6 +18,8 @@ from equirl.envs.scene import Scene
 from equirl.envs.tasks import PlacementError, State, Task
 from equirl.envs.workspace import Workspace
 
+__all__ = ["ManipulationEnv"]
+
 # Actions may exceed 1 by this much, which is rounding; they are clipped.
 _ACTION_TOLERANCE = 1e-6
 
@@ -40,17 +42,17 @@ class ManipulationEnv(EnvBase):
     Use `equirl.envs.make_env`, which validates its arguments.
 
     Attributes:
-        episodes_begun: how many there were since construction.
+        episodes_begun: How many there were since construction.
 
     Args:
-        task: what is to be done.
+        task: What is to be done.
         image_size: S, pixels.
-        seed: as for `set_seed`.
+        seed: As for `set_seed`.
         robot: ``"panda"`` or ``"hand"`` (the free hand).
-        max_steps: length of an episode without success.
+        max_steps: Length of an episode without success.
         time_limit: ``"truncate"``: the last step is truncated, its value is bootstrapped;
             ``"terminate"``: it is terminal.
-        workspace: dimensions of the cell.
+        workspace: Dimensions of the cell.
     """
 
     batch_locked = True
@@ -244,7 +246,7 @@ class ManipulationEnv(EnvBase):
         """Returns the measured state as a plain value (velocities are not part of it).
 
         Raises:
-            RuntimeError: before the first reset.
+            RuntimeError: Before the first reset.
         """
         return self._present().scene
 
@@ -261,13 +263,13 @@ class ManipulationEnv(EnvBase):
         """Starts an episode, at rest, from ``scene``; the next reset draws a new one.
 
         Args:
-            scene: poses of the gripper and of objects of the task, and the task's areas.
+            scene: Poses of the gripper and of objects of the task, and the task's areas.
 
         Returns:
             What `reset` returns, ready for an action and `step`.
 
         Raises:
-            ValueError: if the scene has objects or areas that the task does not have, or the
+            ValueError: If the scene has objects or areas that the task does not have, or the
                 gripper is outside the workspace.
         """
         if not self.workspace.contains(scene.position, margin=5e-3):
@@ -293,7 +295,7 @@ class ManipulationEnv(EnvBase):
         does not change.
 
         Raises:
-            ValueError: if a side is no positive integer.
+            ValueError: If a side is no positive integer.
         """
         for name, value in (("width", width), ("height", height)):
             if not isinstance(value, Integral) or value < 1:

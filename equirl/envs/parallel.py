@@ -17,6 +17,8 @@ from torchrl.envs import EnvBase, ParallelEnv
 
 from equirl.envs.factory import make_env
 
+__all__ = ["WatchedParallelEnv", "WorkerError", "make_parallel_env"]
+
 _NAP = 5e-5  # s between two looks at the workers: they need the cores more than we do
 _GRACE = 0.3  # s for the consequences of a process's end to arrive
 
@@ -31,17 +33,17 @@ class WatchedParallelEnv(ParallelEnv):
     What was collected before stays with the caller: an error ends the workers, not the run.
 
     Args:
-        names: what each worker is called in messages; as many workers.
-        create_env_fn: makes each worker's environment.
-        answer_within: s that the workers may take to start, and each to reset, step or end. With
+        names: What each worker is called in messages; as many workers.
+        create_env_fn: Makes each worker's environment.
+        answer_within: S that the workers may take to start, and each to reset, step or end. With
             ``mp_start_method="spawn"`` allow for the imports of all of them.
-        mp_start_method: how processes start: ``"fork"`` takes a fraction of a second, ``"spawn"``
+        mp_start_method: How processes start: ``"fork"`` takes a fraction of a second, ``"spawn"``
             and ``"forkserver"`` import everything again but are safe beside CUDA.
-        options: further arguments of `ParallelEnv`.
+        options: Further arguments of `ParallelEnv`.
 
     Raises:
-        ValueError: if ``answer_within`` is not positive.
-        WorkerError: when a worker dies or hangs, also while starting.
+        ValueError: If ``answer_within`` is not positive.
+        WorkerError: When a worker dies or hangs, also while starting.
     """
 
     def __init__(
@@ -221,15 +223,15 @@ def make_parallel_env(
     """Returns ``workers`` environments of a task that step together, each with its own scenes.
 
     Args:
-        task: as for `make_env`.
-        workers: how many processes.
-        seed: root of the seeds of all workers.
-        answer_within: as for `WatchedParallelEnv`.
-        mp_start_method: as for `WatchedParallelEnv`.
-        options: as for `make_env`.
+        task: As for `make_env`.
+        workers: How many processes.
+        seed: Root of the seeds of all workers.
+        answer_within: As for `WatchedParallelEnv`.
+        mp_start_method: As for `WatchedParallelEnv`.
+        options: As for `make_env`.
 
     Raises:
-        ValueError: if an argument is not one of these.
+        ValueError: If an argument is not one of these.
     """
     if not isinstance(workers, int) or workers < 1:
         raise ValueError(f"workers must be a positive integer, got {workers!r}")

@@ -9,14 +9,16 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+__all__ = ["Area", "Scene"]
+
 
 @dataclass(frozen=True)
 class Area:
     """A square marked in the depth image, by adding to the height of what lies in it.
 
     Attributes:
-        side: m.
-        raise_by: height added, m.
+        side: M.
+        raise_by: Height added, m.
     """
 
     side: float
@@ -31,15 +33,15 @@ class Scene:
     at the centre of the floor of the bin, z up).
 
     Attributes:
-        position: end effector position, shape (3,).
-        yaw: angle from world x to the finger axis, about world z; unbounded.
-        aperture: distance between the fingers.
-        objects: one row (x, y, z, qx, qy, qz, qw) an object, shape (N, 7).
-        grip: aperture the gripper is driven to; smaller than `aperture` when it squeezes an object.
+        position: End effector position, shape (3,).
+        yaw: Angle from world x to the finger axis, about world z; unbounded.
+        aperture: Distance between the fingers.
+        objects: One row (x, y, z, qx, qy, qz, qw) an object, shape (N, 7).
+        grip: Aperture the gripper is driven to; smaller than `aperture` when it squeezes an object.
             Defaults to `aperture`.
-        names: what each object is, N names of the task's bodies. Empty: its first N, in order.
-        scales: size of each object relative to the task's body, N numbers. Empty: all 1.
-        areas: one row (x, y, yaw) for the centre of each area the task marks, shape (M, 3).
+        names: What each object is, N names of the task's bodies. Empty: its first N, in order.
+        scales: Size of each object relative to the task's body, N numbers. Empty: all 1.
+        areas: One row (x, y, yaw) for the centre of each area the task marks, shape (M, 3).
     """
 
     position: np.ndarray
@@ -90,10 +92,10 @@ class Scene:
         """Returns the scene with the name of each object.
 
         Args:
-            known: the names there are; an object without one takes its place in this order.
+            known: The names there are; an object without one takes its place in this order.
 
         Raises:
-            ValueError: if a name is unknown, or unnamed objects are more than names.
+            ValueError: If a name is unknown, or unnamed objects are more than names.
         """
         for name in self.names:
             if name not in known:

@@ -6,17 +6,19 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+__all__ = ["Bin", "Workspace"]
+
 
 @dataclass(frozen=True)
 class Bin:
     """A square frustum: its floor is the workspace, its walls rise outwards (metres).
 
     Attributes:
-        floor_half_width: half the side of the floor, at height 0.
-        rim_half_width: half the side of the opening.
-        rim_height: height of the opening above the floor.
-        floor_friction: lateral friction of the floor.
-        wall_friction: lateral friction of the walls; none, so that objects slide back.
+        floor_half_width: Half the side of the floor, at height 0.
+        rim_half_width: Half the side of the opening.
+        rim_height: Height of the opening above the floor.
+        floor_friction: Lateral friction of the floor.
+        wall_friction: Lateral friction of the walls; none, so that objects slide back.
     """
 
     floor_half_width: float = 0.15
@@ -36,15 +38,15 @@ class Workspace:
     x = 0.45 m, the arm stands at x = -0.10 m; here that is ``arm_base_x``.
 
     Attributes:
-        half_width: the end effector stays within +-half_width in x and y (m).
-        z_min: lowest end effector height (m).
-        z_max: greatest end effector height (m).
-        home_height: end effector height at the start of an episode, at x = y = yaw = 0 (m).
-        position_step: displacement along an axis for an action component of 1 (m).
-        yaw_step: rotation for an action component of 1 (rad).
-        max_aperture: distance between the open fingers (m).
-        arm_base_x: x of the arm's base (m).
-        bin: the bin.
+        half_width: The end effector stays within +-half_width in x and y (m).
+        z_min: Lowest end effector height (m).
+        z_max: Greatest end effector height (m).
+        home_height: End effector height at the start of an episode, at x = y = yaw = 0 (m).
+        position_step: Displacement along an axis for an action component of 1 (m).
+        yaw_step: Rotation for an action component of 1 (rad).
+        max_aperture: Distance between the open fingers (m).
+        arm_base_x: X of the arm's base (m).
+        bin: The bin.
     """
 
     half_width: float = 0.15

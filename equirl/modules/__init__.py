@@ -1,15 +1,15 @@
 """Steerable layers, the networks built from them, their distribution, and the baseline."""
 
-from .actor import EquivariantPolicy, make_actor
-from .backend import BACKENDS, NativeUnavailable, resolve_backend
-from .cnn import CNNEncoder, make_cnn_actor, make_cnn_critic
-from .critic import EquivariantQHeads, make_critic
-from .distributions import RadialTanhNormal
-from .encoder import EquivariantEncoder
-from .fields import FieldType
-from .filters import shared_filters
-from .pooling import GroupMaxPool
-from .steerable import SteerableConv, SteerableLinear
+from equirl.modules.actor import EquivariantPolicy, make_actor
+from equirl.modules.backend import BACKENDS, NativeUnavailable, resolve_backend
+from equirl.modules.cnn import CNNEncoder, make_cnn_actor, make_cnn_critic
+from equirl.modules.critic import EquivariantQHeads, make_critic
+from equirl.modules.distributions import RadialTanhNormal
+from equirl.modules.encoder import EquivariantEncoder
+from equirl.modules.fields import FieldType
+from equirl.modules.filters import shared_filters
+from equirl.modules.pooling import GroupMaxPool
+from equirl.modules.steerable import SteerableConv, SteerableLinear
 
 __all__ = [
     "BACKENDS",

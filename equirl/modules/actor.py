@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import torch
-from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
+from equirl.modules.distributions import RadialTanhNormal
+from equirl.modules.encoder import EquivariantEncoder
+from equirl.modules.fields import FieldType
+from equirl.modules.steerable import SteerableLinear
+from equirl.modules.wiring import as_actor
 from equirl.symmetry import SymmetryGroup, action_representation
-
-from .distributions import RadialTanhNormal
-from .encoder import EquivariantEncoder
-from .fields import FieldType
-from .steerable import SteerableLinear
 
 __all__ = ["LOG_STD_RANGE", "EquivariantPolicy", "make_actor"]
 
@@ -24,16 +23,12 @@ class EquivariantPolicy(nn.Module):
     """Encoder and head: the Gaussian's mean, an action, and invariant standard deviations.
 
     Args:
-        group: The symmetry group or its name.
-        hidden: Width of the encoder.
-        image_size: Side of the image in pixels.
+        encoder: Maps an observation to regular fields.
         mode: ``"strict"``: the mean transforms like the physical action and each of its
             irreducible blocks has one standard deviation, so that x and y share theirs.
             ``"paper"`` (appendix A): theta's mean is an invariant and each of the five
             components has its own standard deviation.
-        backend: Of the encoder: ``"native"``, ``"dense"`` or ``"auto"``, the faster one.
-        device: Where the parameters live.
-        generator: Source of the initial weights; torch's global one if None.
+        generator: Source of the head's initial weights; torch's global one if None.
 
     Attributes:
         in_type: Two trivial fields, depth and flag.
@@ -42,26 +37,15 @@ class EquivariantPolicy(nn.Module):
 
     def __init__(
         self,
-        group: SymmetryGroup | str,
+        encoder: EquivariantEncoder,
         *,
-        hidden: int = 64,
-        image_size: int = 128,
         mode: str = "strict",
-        backend: str = "auto",
-        device: torch.device | str | None = None,
         generator: torch.Generator | None = None,
     ):
         super().__init__()
         self.out_rep = action_representation(mode)
-        self.encoder = EquivariantEncoder(
-            group,
-            hidden=hidden,
-            image_size=image_size,
-            backend=backend,
-            device=device,
-            generator=generator,
-        )
-        self.in_type = self.encoder.in_type
+        self.encoder = encoder
+        self.in_type = encoder.in_type
         group = self.in_type.group
         #: For each log standard deviation, how many components of the action it serves.
         self.sharing = (
@@ -71,7 +55,7 @@ class EquivariantPolicy(nn.Module):
         )
         out_type = FieldType.of(group, self.out_rep) + FieldType.trivial(group, len(self.sharing))
         self.head = SteerableLinear(self.encoder.out_type, out_type, generator=generator)
-        self.to(next(self.encoder.parameters()).device)
+        self.to(next(encoder.parameters()).device)
 
     def forward(self, depth: Tensor, holding: Tensor) -> tuple[Tensor, Tensor]:
         """Maps (*batch, 1, S, S) and (*batch, 1) to mean and deviation, both (*batch, 5)."""
@@ -127,20 +111,15 @@ def make_actor(
     Example:
         >>> actor = make_actor("D4", hidden=16, image_size=64)
     """
-    policy = EquivariantPolicy(
+    encoder = EquivariantEncoder(
         group,
         hidden=hidden,
         image_size=image_size,
-        mode=mode,
         backend=backend,
         device=device,
         generator=generator,
     )
-    radial = mode == "strict"
-    return ProbabilisticActor(
-        TensorDictModule(policy, in_keys=["depth", "holding"], out_keys=["loc", "scale"]),
-        in_keys=["loc", "scale"],
-        distribution_class=RadialTanhNormal if radial else TanhNormal,
-        distribution_kwargs={"representation": policy.out_rep} if radial else {},
-        return_log_prob=True,
-    )
+    policy = EquivariantPolicy(encoder, mode=mode, generator=generator)
+    if mode == "paper":
+        return as_actor(policy, TanhNormal)
+    return as_actor(policy, RadialTanhNormal, representation=policy.out_rep)

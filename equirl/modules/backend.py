@@ -9,9 +9,8 @@ from typing import Literal
 
 import torch
 
+from equirl.modules.native.library import NativeUnavailable, load
 from equirl.symmetry import SymmetryGroup
-
-from .native.library import NativeUnavailable, load
 
 __all__ = ["BACKENDS", "NativeUnavailable", "resolve_backend"]
 
@@ -36,7 +35,7 @@ def resolve_backend(
     information.
 
     Args:
-        name: One of :data:`BACKENDS`.
+        name: One of `BACKENDS`.
         group: The symmetry group; the kernels serve those that contain the quarter turns.
         device: Where the network is; the kernels run on the CPU.
 

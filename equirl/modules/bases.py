@@ -59,7 +59,7 @@ def kernel_basis(
 
     Args:
         group: The symmetry group.
-        in_field: Name of the input field, see :class:`~equirl.modules.fields.FieldType`.
+        in_field: Name of the input field, see `FieldType`.
         out_field: Name of the output field.
         kernel_size: Side of the filter in pixels.
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .bases import KernelBasis, field_label, kernel_basis
-from .fields import FieldType
+from equirl.modules.bases import KernelBasis, field_label, kernel_basis
+from equirl.modules.fields import FieldType
 
 __all__ = ["Block", "field_blocks", "initial_weights"]
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import torch
 import torch.nn.functional as F
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictSequential
 from torch import Tensor, nn
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
-from .actor import LOG_STD_RANGE
-from .layout import check_sizes, pyramid, resolve_device, stack_observation
+from equirl.modules.actor import LOG_STD_RANGE
+from equirl.modules.layout import check_sizes, pyramid, resolve_device, stack_observation
+from equirl.modules.wiring import as_actor, as_critic
 
 __all__ = ["CNNEncoder", "make_cnn_actor", "make_cnn_critic"]
 
@@ -108,19 +109,14 @@ def make_cnn_actor(
         generator: Source of the initial weights, on the CPU; torch's global one if None.
 
     Returns:
-        An actor with the keys of :func:`~equirl.modules.make_actor`.
+        An actor with the keys of `make_actor`.
 
     Raises:
         ValueError: The width or the image size is not supported.
     """
     policy = _CNNPolicy(CNNEncoder(hidden=hidden, image_size=image_size))
     _initialise(policy, device, generator)
-    return ProbabilisticActor(
-        TensorDictModule(policy, in_keys=["depth", "holding"], out_keys=["loc", "scale"]),
-        in_keys=["loc", "scale"],
-        distribution_class=TanhNormal,
-        return_log_prob=True,
-    )
+    return as_actor(policy, TanhNormal)
 
 
 def make_cnn_critic(
@@ -141,19 +137,12 @@ def make_cnn_critic(
         generator: Source of the initial weights, on the CPU; torch's global one if None.
 
     Returns:
-        Two modules in sequence with the keys of :func:`~equirl.modules.make_critic`.
+        Two modules in sequence with the keys of `make_critic`.
 
     Raises:
         ValueError: The width or the image size is not supported.
     """
     encoder = CNNEncoder(hidden=hidden, image_size=image_size)
-    critic = TensorDictSequential(
-        TensorDictModule(encoder, in_keys=["depth", "holding"], out_keys=["_features"]),
-        TensorDictModule(
-            _QHeads(encoder.out_features, heads),
-            in_keys=["_features", "action"],
-            out_keys=["state_action_value"],
-        ),
-    )
+    critic = as_critic(encoder, _QHeads(encoder.out_features, heads))
     _initialise(critic, device, generator)
     return critic

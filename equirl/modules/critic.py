@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import torch
 import torch.nn.functional as F
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictSequential
 from torch import Tensor, nn
 
+from equirl.modules.encoder import EquivariantEncoder
+from equirl.modules.fields import FieldType
+from equirl.modules.pooling import GroupMaxPool
+from equirl.modules.steerable import SteerableLinear
+from equirl.modules.wiring import as_critic
 from equirl.symmetry import SymmetryGroup, action_representation
-
-from .encoder import EquivariantEncoder
-from .fields import FieldType
-from .pooling import GroupMaxPool
-from .steerable import SteerableLinear
 
 __all__ = ["EquivariantQHeads", "make_critic"]
 
@@ -49,7 +49,7 @@ class EquivariantQHeads(nn.Module):
             raise ValueError(f"heads={heads!r}: expected a positive integer")
         width = len(features.fields) if width is None else width
         if not isinstance(width, int) or width < 1:
-            raise ValueError(f"head width={width!r}: expected a positive integer")
+            raise ValueError(f"head_width={width!r}: expected a positive integer")
         group = features.group
         self.in_rep = action_representation(mode)
         self.in_type = features + FieldType.of(group, self.in_rep)
@@ -121,7 +121,4 @@ def make_critic(
         encoder.out_type, mode=mode, heads=heads, width=head_width, generator=generator
     )
     q_heads.to(next(encoder.parameters()).device)
-    return TensorDictSequential(
-        TensorDictModule(encoder, in_keys=["depth", "holding"], out_keys=["_features"]),
-        TensorDictModule(q_heads, in_keys=["_features", "action"], out_keys=["state_action_value"]),
-    )
+    return as_critic(encoder, q_heads)

@@ -118,7 +118,7 @@ class RadialTanhNormal(D.Distribution):
     def sample_and_log_prob(
         self, sample_shape: torch.Size | tuple[int, ...] = ()
     ) -> tuple[Tensor, Tensor]:
-        """As :meth:`rsample_and_log_prob`, without gradients through the sample."""
+        """As `rsample_and_log_prob`, without gradients through the sample."""
         with torch.no_grad():
             raw = self._draw(sample_shape)
             value = self._squash(raw)

@@ -8,13 +8,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from equirl.modules.backend import resolve_backend
+from equirl.modules.fields import FieldType
+from equirl.modules.layout import check_sizes, pyramid, resolve_device, stack_observation
+from equirl.modules.native import layer as native
+from equirl.modules.steerable import SteerableConv
 from equirl.symmetry import SymmetryGroup
-
-from .backend import resolve_backend
-from .fields import FieldType
-from .layout import check_sizes, pyramid, resolve_device, stack_observation
-from .native import layer as native
-from .steerable import SteerableConv
 
 __all__ = ["EquivariantEncoder"]
 

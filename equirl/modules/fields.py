@@ -23,7 +23,7 @@ class FieldType:
     """A stack of fields of one group, in the order of the channels.
 
     A *regular* field has one channel per group element, permuted by the group; the
-    other fields are the blocks of a :class:`~equirl.symmetry.Representation`,
+    other fields are the blocks of a `Representation`,
     restricted to the group. Where a restriction splits or merges blocks the fields
     say so: a half turn acts on x and y alike, so for n = 2 a vector is two
     one-dimensional fields, and without reflections a sign field is a trivial one.

@@ -2,7 +2,7 @@
 
 A steerable convolution's filter is a function of its weights. A soft actor-critic
 update evaluates the same weights several times (losses, detached copies); inside
-:func:`shared_filters` the expansion is done once per set of weights and reused.
+`shared_filters` the expansion is done once per set of weights and reused.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ def check_sizes(hidden: int, image_size: int) -> None:
     """Checks the width and the image size of an encoder.
 
     Raises:
-        ValueError: The image size is not one of :data:`IMAGE_SIZES`, or the width cannot be
+        ValueError: The image size is not one of `IMAGE_SIZES`, or the width cannot be
             halved as often as the layers ask for.
     """
     if image_size not in IMAGE_SIZES:

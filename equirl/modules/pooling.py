@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
-from .fields import FieldType
+from equirl.modules.fields import FieldType
 
 __all__ = ["GroupMaxPool"]
 

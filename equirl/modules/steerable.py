@@ -9,11 +9,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .bases import KernelBasis
-from .blocks import Block, field_blocks, initial_weights
-from .fields import FieldType
-from .filters import expanded_filter
-from .layout import resolve_device
+from equirl.modules.bases import KernelBasis
+from equirl.modules.blocks import Block, field_blocks, initial_weights
+from equirl.modules.fields import FieldType
+from equirl.modules.filters import expanded_filter
+from equirl.modules.layout import resolve_device
 
 __all__ = ["SteerableConv", "SteerableLinear"]
 
@@ -149,14 +149,14 @@ class SteerableConv(_Steerable):
 
     Same kernels, weights and initialisation as escnn's ``R2Conv``; the filter is expanded
     from the weights in every pass, unless inside
-    :func:`~equirl.modules.filters.shared_filters`.
+    `shared_filters`.
 
     Args:
         in_type: Fields of the input.
         out_type: Fields of the output.
         kernel_size: Side of the filter in pixels.
         padding: Zero padding in pixels.
-        **kwargs: ``bias``, ``device`` and ``generator``, as for :class:`SteerableLinear`.
+        **kwargs: ``bias``, ``device`` and ``generator``, as for `SteerableLinear`.
     """
 
     def __init__(

@@ -1,5 +1,5 @@
 """Losses on top of torchrl.objectives."""
 
-from .sac import SACLoss
+from equirl.objectives.sac import SACLoss
 
 __all__ = ["SACLoss"]

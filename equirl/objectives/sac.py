@@ -22,13 +22,22 @@ class SACLoss(TorchRLSACLoss):
     anew for the actor's loss. Here the critic is a sequence of an encoder and heads: the
     features of the state are computed once and serve both losses, the actor's loss
     sends no gradient into the encoder or the heads, and every steerable filter is
-    expanded once a call. Values and gradients are those of the textbook computation.
+    expanded once a call. Values and gradients are those of the textbook computation: with
+    gamma the discount, alpha the temperature, H the target entropy, Q_i the heads and Q'_i
+    those of the target critic, for transitions (s, a, r, s', terminated)
+
+    * target:           y = r + gamma (1 - terminated) (min_i Q'_i(s', a') - alpha log pi(a'|s')),
+      with a' ~ pi(.|s');
+    * ``loss_qvalue`` = sum_i mean (Q_i(s, a) - y)^2;
+    * ``loss_actor``  = mean (alpha log pi(b|s) - min_i Q_i(s, b)), with b ~ pi(.|s)
+      reparameterised and Q_i held fixed;
+    * ``loss_alpha``  = -mean (log alpha (log pi(b|s) + H)), the last factor held fixed.
 
     Args:
         actor: Stochastic policy, in_keys those of the observation.
         critic: A sequence of two modules: the encoder, observation to features, and the
             heads, features and action to ``state_action_value`` of shape (B, heads).
-        alpha: Initial entropy temperature.
+        alpha_init: Initial entropy temperature.
         target_entropy: Entropy that the temperature is tuned to, in nats.
         gamma: Discount factor.
 
@@ -37,8 +46,9 @@ class SACLoss(TorchRLSACLoss):
         ``loss_qvalue`` (the sum over heads of the mean squared errors), ``loss_alpha``,
         ``alpha`` and ``entropy``; writes ``td_error`` (B,), the mean of the heads'
         absolute errors, into its input. The sum of the three losses can be
-        differentiated at once: each reaches its own parameters only. :meth:`backward`
-        does so with less memory.
+        differentiated at once: each reaches its own parameters only. `backward`
+        does so with less memory. Unlike TorchRL's losses it takes no loose tensors by name:
+        the batch size cannot be told from images of one channel.
 
     Raises:
         TypeError: The critic is not a sequence of an encoder and heads.
@@ -49,7 +59,7 @@ class SACLoss(TorchRLSACLoss):
         actor: ProbabilisticTensorDictSequential,
         critic: TensorDictSequential,
         *,
-        alpha: float = 1e-2,
+        alpha_init: float = 1e-2,
         target_entropy: float = -5.0,
         gamma: float = 0.99,
     ):
@@ -63,7 +73,7 @@ class SACLoss(TorchRLSACLoss):
             critic,
             num_qvalue_nets=None,
             loss_function="l2",
-            alpha_init=alpha,
+            alpha_init=alpha_init,
             target_entropy=target_entropy,
             # TorchRL would weight the actor's and the temperature's losses as well.
             use_prioritized_weights=False,

@@ -1,10 +1,16 @@
 """The symmetry, stated once: groups, representations, and how every key transforms."""
 
-from .audit import audit_env
-from .audit_result import EnvAudit
-from .groups import Element, SymmetryGroup
-from .representations import Irrep, Representation, ScalarField
-from .spec import ACTION, ACTION_PAPER, SymmetrySpec, action_representation, manipulation_spec
+from equirl.symmetry.audit import audit_env
+from equirl.symmetry.audit_result import EnvAudit
+from equirl.symmetry.groups import Element, SymmetryGroup
+from equirl.symmetry.representations import Irrep, Representation, ScalarField
+from equirl.symmetry.spec import (
+    ACTION,
+    ACTION_PAPER,
+    SymmetrySpec,
+    action_representation,
+    manipulation_spec,
+)
 
 __all__ = [
     "ACTION",

@@ -13,10 +13,15 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 
-from .audit_quantities import FLAGS
-from .audit_result import EnvAudit, describe
-from .audit_transforms import displace_objects, transform_action, transform_image, transform_scene
-from .groups import Element, SymmetryGroup
+from equirl.symmetry.audit_quantities import FLAGS
+from equirl.symmetry.audit_result import EnvAudit, describe
+from equirl.symmetry.audit_transforms import (
+    displace_objects,
+    transform_action,
+    transform_image,
+    transform_scene,
+)
+from equirl.symmetry.groups import Element, SymmetryGroup
 
 __all__ = ["Auditable", "Policy", "audit_env"]
 
@@ -80,23 +85,23 @@ def audit_env(
     and not reflected. Afterwards the environments stand anywhere: set their seeds before use.
 
     Args:
-        env: the environment, or one with transforms around it, which are not audited.
-        group: the group or its name.
-        scenes: how many scenes.
-        steps: length of an episode, unless it ends earlier.
-        seed: of the scenes and of what is drawn here.
-        policy: writes ``action`` for the original episodes, for example an expert; copies replay
+        env: The environment, or one with transforms around it, which are not audited.
+        group: The group or its name.
+        scenes: How many scenes.
+        steps: Length of an episode, unless it ends earlier.
+        seed: Of the scenes and of what is drawn here.
+        policy: Writes ``action`` for the original episodes, for example an expert; copies replay
             it. None: actions are uniform in [-1, 1].
-        reference: an environment of the same task that plays the same scenes and actions, for
+        reference: An environment of the same task that plays the same scenes and actions, for
             example with ``robot="hand"``: what only ``env`` shows is then due to its arm.
-        pixel_tolerance: depths differ if they do by more than this, m.
-        displacement: of the objects in the copies that show how much is noise, m.
+        pixel_tolerance: Depths differ if they do by more than this, m.
+        displacement: Of the objects in the copies that show how much is noise, m.
 
     Returns:
         The errors, with tables of them and findings about their causes.
 
     Raises:
-        ValueError: if the group has no element to audit, or there is nothing to play.
+        ValueError: If the group has no element to audit, or there is nothing to play.
     """
     group = SymmetryGroup(group)
     elements = tuple(g for g in group.grid_elements if g != _IDENTITY)

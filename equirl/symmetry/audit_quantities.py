@@ -13,11 +13,11 @@ class Quantity:
     """Something that is compared.
 
     Attributes:
-        key: a key of the environment's tensordict, or an entry of the scene behind it.
-        error: what the numbers are.
-        unit: what they are shown in; they are stored in m, rad or as a share.
-        scale: from the stored unit to the shown one.
-        tolerance: an excess over the noise that is no finding, after a step, in the stored unit; a
+        key: A key of the environment's tensordict, or an entry of the scene behind it.
+        error: What the numbers are.
+        unit: What they are shown in; they are stored in m, rad or as a share.
+        scale: From the stored unit to the shown one.
+        tolerance: An excess over the noise that is no finding, after a step, in the stored unit; a
             tenth of it when nothing has moved yet.
     """
 

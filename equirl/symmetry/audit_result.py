@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from .audit_quantities import FLAGS, QUANTITIES, Quantity
-from .groups import Element, SymmetryGroup
+from equirl.symmetry.audit_quantities import FLAGS, QUANTITIES, Quantity
+from equirl.symmetry.groups import Element, SymmetryGroup
 
 __all__ = ["Cause", "EnvAudit", "Finding", "describe", "markdown_table"]
 
@@ -38,12 +38,12 @@ class Finding:
     """Something that differs by more than the noise.
 
     Attributes:
-        environment: where.
-        key: what.
-        kind: in which copies.
-        cause: why.
-        error: how much it typically differs (m, rad or a share), see `EnvAudit.typical`.
-        noise: how much it does when objects are displaced a little.
+        environment: Where.
+        key: What.
+        kind: In which copies.
+        cause: Why.
+        error: How much it typically differs (m, rad or a share), see `EnvAudit.typical`.
+        noise: How much it does when objects are displaced a little.
     """
 
     environment: str
@@ -73,15 +73,15 @@ class EnvAudit:
     errors add up.
 
     Attributes:
-        group: whose elements were audited.
-        elements: the audited elements, all without the identity.
-        left_out: elements of the group that do not map the pixel grid, and the square bin and
+        group: Whose elements were audited.
+        elements: The audited elements, all without the identity.
+        left_out: Elements of the group that do not map the pixel grid, and the square bin and
             workspace, onto themselves: they are no symmetries to ask for.
-        environments: what the audited environment is called, then the reference, if there is one.
-        unreflectable: for scenes that were only turned: the objects that are not their own
+        environments: What the audited environment is called, then the reference, if there is one.
+        unreflectable: For scenes that were only turned: the objects that are not their own
             mirror images.
-        actions: the actions played, shape (n, 5).
-        comparisons: columns of one length: ``environment``, ``play``, ``kind``, ``element`` (such
+        actions: The actions played, shape (n, 5).
+        comparisons: Columns of one length: ``environment``, ``play``, ``kind``, ``element`` (such
             as ``"flip, 90°"``), ``scene``, ``step``, ``clipped`` (a target was clipped to the
             workspace), ``last`` (of its play), and the error of each of `QUANTITIES` (m, rad or a
             share).
@@ -99,8 +99,8 @@ class EnvAudit:
         """Returns some of the errors of ``key``, and the scenes they are from.
 
         Args:
-            key: a key of `QUANTITIES`.
-            conditions: for columns of `comparisons`, a value or a tuple of values.
+            key: A key of `QUANTITIES`.
+            conditions: For columns of `comparisons`, a value or a tuple of values.
         """
         chosen = np.ones(len(self.comparisons["scene"]), dtype=bool)
         for column, values in conditions.items():
@@ -115,8 +115,8 @@ class EnvAudit:
         the mean over all.
 
         Args:
-            key: a key of `QUANTITIES`.
-            conditions: as for `select`.
+            key: A key of `QUANTITIES`.
+            conditions: As for `select`.
         """
         errors, scenes = self.select(key, **conditions)
         if len(errors) == 0:

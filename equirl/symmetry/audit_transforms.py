@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from .groups import Element
+from equirl.symmetry.groups import Element
 
 __all__ = ["displace_objects", "transform_action", "transform_image", "transform_scene"]
 

@@ -1,7 +1,7 @@
 """How tensors transform under rotations and reflections of the plane.
 
-A vector-valued quantity is described by a :class:`Representation`, a direct sum of
-the irreducible blocks below; an image by :class:`ScalarField`. Both are restrictions
+A vector-valued quantity is described by a `Representation`, a direct sum of
+the irreducible blocks below; an image by `ScalarField`. Both are restrictions
 of representations of O(2), so one declaration serves every subgroup.
 """
 
@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .groups import Element
+from equirl.symmetry.groups import Element
 
 __all__ = ["Irrep", "Representation", "ScalarField"]
 

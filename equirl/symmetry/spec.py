@@ -9,8 +9,8 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from .groups import Element
-from .representations import Representation, ScalarField
+from equirl.symmetry.groups import Element
+from equirl.symmetry.representations import Representation, ScalarField
 
 __all__ = ["ACTION", "ACTION_PAPER", "SymmetrySpec", "action_representation", "manipulation_spec"]
 
@@ -39,8 +39,8 @@ class SymmetrySpec:
     """Declares how tensordict keys transform; keys it does not name are invariant.
 
     Args:
-        keys: For each key, a :class:`Representation` (last dimension) or a
-            :class:`ScalarField` (last two dimensions). The entry under
+        keys: For each key, a `Representation` (last dimension) or a
+            `ScalarField` (last two dimensions). The entry under
             ``("next", key)`` transforms like ``key``.
 
     Example:

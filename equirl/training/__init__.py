@@ -1,13 +1,13 @@
 """Training, checkpoints, evaluation and reports of runs."""
 
-from .checkpoint import CheckpointError, load_checkpoint
-from .evaluation import Evaluation, evaluate
-from .folder import CHECKPOINT, FolderError, load_run_config
-from .learner import Learner, load_policy, make_networks
-from .loop import TrainingRun, make_run_env
-from .seeding import Purpose, scene_seed
-from .train import train
-from .video import film_policy
+from equirl.training.checkpoint import CheckpointError, load_checkpoint
+from equirl.training.evaluation import Evaluation, evaluate
+from equirl.training.folder import CHECKPOINT, FolderError, load_run_config
+from equirl.training.learner import Learner, load_policy, make_networks
+from equirl.training.loop import TrainingRun, make_run_env
+from equirl.training.seeding import Purpose, scene_seed
+from equirl.training.train import train
+from equirl.training.video import film_policy
 
 __all__ = [
     "CHECKPOINT",

@@ -16,7 +16,7 @@ from equirl.config import is_free
 
 __all__ = ["CheckpointError", "check_same_config", "load_checkpoint", "save_checkpoint"]
 
-_FORMAT = 2
+_FORMAT = 3
 
 
 class CheckpointError(RuntimeError):

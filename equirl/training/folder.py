@@ -12,8 +12,7 @@ from pathlib import Path
 from types import FrameType
 
 from equirl.config import Config, flatten, load_config, save_config
-
-from .checkpoint import check_same_config
+from equirl.training.checkpoint import check_same_config
 
 __all__ = [
     "CHECKPOINT",

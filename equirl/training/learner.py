@@ -23,10 +23,9 @@ from equirl.modules import (
 )
 from equirl.objectives import SACLoss
 from equirl.symmetry import SymmetryGroup
-
-from .checkpoint import check_same_config, load_checkpoint
-from .folder import CHECKPOINT, load_run_config
-from .seeding import Purpose, torch_generator
+from equirl.training.checkpoint import check_same_config, load_checkpoint
+from equirl.training.folder import CHECKPOINT, load_run_config
+from equirl.training.seeding import Purpose, torch_generator
 
 __all__ = ["Learner", "load_policy", "make_networks"]
 
@@ -73,7 +72,7 @@ class Learner:
         self.loss = SACLoss(
             self.actor,
             critic,
-            alpha=algorithm.alpha,
+            alpha_init=algorithm.alpha,
             target_entropy=algorithm.target_entropy,
             gamma=algorithm.discount,
         ).to(config.torch_device)
@@ -82,6 +81,11 @@ class Learner:
         self.optimizer = torch.optim.Adam(
             self.loss.parameters(), lr=algorithm.learning_rate, fused=True
         )
+
+    @property
+    def metric_names(self) -> tuple[str, ...]:
+        """What `update` reports."""
+        return (*self.loss.out_keys, "td_error")
 
     @property
     def policy(self) -> ProbabilisticActor:
@@ -95,7 +99,8 @@ class Learner:
             batch: Transitions of batch size (B,).
 
         Returns:
-            The losses, temperature and entropy, and the mean absolute Bellman error.
+            The losses, temperature and entropy, and the mean absolute Bellman error
+            ``td_error``.
         """
         self.optimizer.zero_grad(set_to_none=True)
         losses = self.loss.backward(batch)
@@ -117,7 +122,7 @@ class Learner:
         return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores what :meth:`state_dict` returned."""
+        """Restores what `state_dict` returned."""
         self.loss.load_state_dict(state["loss"])
         self.optimizer.load_state_dict(state["optimizer"])
         if self.average is not None:

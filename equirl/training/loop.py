@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections import deque
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
-from tqdm import tqdm
 
 from equirl.collectors import DemonstrationCollector, Episode, OnlineCollector
 from equirl.config import Config, flatten
@@ -19,14 +16,19 @@ from equirl.data import load_replay_state, make_replay_buffer, replay_state
 from equirl.envs import ManipulationEnv, make_env, make_expert
 from equirl.envs.tasks import find_task
 from equirl.modules import shared_filters
-
-from .checkpoint import CheckpointError, check_same_config, load_checkpoint, save_checkpoint
-from .evaluation import Evaluation, evaluate
-from .folder import CHECKPOINT
-from .learner import Learner
-from .metrics import MetricsLog
-from .seeding import Purpose, scene_seed, seed_everything, torch_generator
-from .timing import Stopwatch
+from equirl.training.checkpoint import (
+    CheckpointError,
+    check_same_config,
+    load_checkpoint,
+    save_checkpoint,
+)
+from equirl.training.evaluation import Evaluation, evaluate
+from equirl.training.folder import CHECKPOINT
+from equirl.training.learner import Learner
+from equirl.training.metrics import Averages, MetricsLog
+from equirl.training.progress import Progress
+from equirl.training.seeding import Purpose, scene_seed, seed_everything, torch_generator
+from equirl.training.timing import Stopwatch
 
 __all__ = ["TrainingRun", "make_run_env"]
 
@@ -54,7 +56,7 @@ def make_run_env(config: Config, **options: Any) -> ManipulationEnv:
 class TrainingRun:
     """One run of the paper's training (section 7 of its method, appendix D).
 
-    Construction builds everything from the configuration; :meth:`run` trains, going on
+    Construction builds everything from the configuration; `run` trains, going on
     from the folder's checkpoint if there is one. A run stopped at any moment and
     resumed is the run never stopped, bit for bit on one thread.
 
@@ -92,10 +94,8 @@ class TrainingRun:
         self.log = MetricsLog(folder, config)
         self.clock = Stopwatch(PARTS)
         self.step = 0
-        self._sums: dict[str, float] = {}
-        self._updates = 0
-        self._recent: deque[Episode] = deque(maxlen=20)
-        self._greedy = ""
+        self.averages = Averages(self.learner.metric_names)
+        self.progress = Progress(config.logging.progress)
 
     def run(self) -> Evaluation | None:
         """Trains to the configured number of steps, then evaluates on the test scenes.
@@ -140,7 +140,7 @@ class TrainingRun:
     def _train(self) -> bool:
         """The loop of the paper; True when it reached the last step."""
         config = self.config
-        with self._training_progress() as bar:
+        with self.progress.bar(total=config.steps, initial=self.step, unit="step") as bar:
             while self.step < config.steps:
                 with shared_filters():  # the actor's, from acting to the update
                     episode = self._step()
@@ -149,7 +149,7 @@ class TrainingRun:
                     self._log_episode(episode)
                 if config.evaluation.every and self.step % config.evaluation.every == 0:
                     self._validate()
-                self._show(bar)
+                self.progress.advance(bar, self.clock.mean("update"))
                 stop = self.should_stop()
                 if stop or self.step % config.checkpoint_every == 0 or self.step == config.steps:
                     self._save()
@@ -169,16 +169,11 @@ class TrainingRun:
             with self.clock.measure("replay"):
                 batch = self.buffer.sample()
             with self.clock.measure("update"):
-                self._accumulate(self.learner.update(batch))
+                self.averages.add(self.learner.update(batch))
         return episode
 
-    def _accumulate(self, metrics: dict[str, float]) -> None:
-        self._updates += 1
-        for name, value in metrics.items():
-            self._sums[name] = self._sums.get(name, 0.0) + value
-
     def _log_episode(self, episode: Episode) -> None:
-        self._recent.append(episode)
+        self.progress.note(episode)
         row: dict[str, float | int] = {
             "step": self.step,
             "episode": episode.index,
@@ -187,14 +182,11 @@ class TrainingRun:
             "return": episode.undiscounted,
             "discounted_return": episode.discounted,
         }
-        for name in (*self.learner.loss.out_keys, "td_error"):
-            row[name] = self._sums.get(name, 0.0) / max(self._updates, 1)
-        self.log.write("metrics", row)
-        self._sums, self._updates = {}, 0
+        self.log.write("metrics", row | self.averages.read())
 
     def _validate(self) -> None:
         outcome = self._evaluate(Purpose.VALIDATION, self.config.evaluation.episodes)
-        self._greedy = f"{outcome.success_rate:.0%}"
+        self.progress.greedy = f"{outcome.success_rate:.0%}"
         low, high = outcome.interval
         row = {
             "step": self.step,
@@ -209,40 +201,17 @@ class TrainingRun:
 
     def _evaluate(self, purpose: Purpose, episodes: int) -> Evaluation:
         seeds = [scene_seed(self.config.seed, purpose, index) for index in range(episodes)]
-        with self.clock.measure("evaluation"), self._progress(episodes, purpose) as bar:
+        name = f"{purpose.name.lower()} scenes"
+        bar = self.progress.bar(total=episodes, desc=name, unit="episode", leave=False)
+        with self.clock.measure("evaluation"), bar as shown:
             return evaluate(
                 self.evaluation_env,
                 self.learner.policy,
                 seeds,
                 discount=self.config.evaluation.discount,
                 device=self.config.torch_device,
-                on_episode=lambda _: bar.update(1) if bar is not None else None,
+                on_episode=lambda _: shown.update(1),
             )
-
-    def _progress(self, episodes: int, purpose: Purpose) -> AbstractContextManager[Any]:
-        if not self.config.logging.progress:
-            return nullcontext()
-        name = f"{purpose.name.lower()} scenes"
-        return tqdm(total=episodes, desc=name, unit="episode", leave=False, dynamic_ncols=True)
-
-    def _training_progress(self) -> AbstractContextManager[Any]:
-        if not self.config.logging.progress:
-            return nullcontext()
-        return tqdm(total=self.config.steps, initial=self.step, unit="step", dynamic_ncols=True)
-
-    def _show(self, bar: tqdm | None) -> None:
-        if bar is None:
-            return
-        if self._recent:
-            count = len(self._recent)
-            shown = {
-                "return": f"{sum(e.discounted for e in self._recent) / count:.2f}",
-                "success": f"{sum(e.success for e in self._recent) / count:.0%}",
-                "greedy": self._greedy or "-",
-                "update": f"{self.clock.mean('update') * 1e3:.0f}ms",
-            }
-            bar.set_postfix(shown, refresh=False)
-        bar.update(1)
 
     def _save(self) -> None:
         with self.clock.measure("checkpoint"):
@@ -256,9 +225,7 @@ class TrainingRun:
                 "learner": self.learner.state_dict(),
                 "buffer": replay_state(self.buffer),
                 "collector": self.collector.state_dict(),
-                "sums": self._sums,
-                "updates": self._updates,
-                "recent": [vars(episode) for episode in self._recent],
+                "averages": self.averages.state_dict(),
                 "clock": self.clock.state_dict(),
                 "replay_rng": self.generator.get_state(),
                 "policy_rng": torch.get_rng_state(),
@@ -278,8 +245,7 @@ class TrainingRun:
         self.learner.load_state_dict(state["learner"])
         load_replay_state(self.buffer, state["buffer"])
         self.collector.load_state_dict(state["collector"])
-        self._sums, self._updates = state["sums"], state["updates"]
-        self._recent.extend(Episode(**episode) for episode in state["recent"])
+        self.averages.load_state_dict(state["averages"])
         self.clock.load_state_dict(state["clock"])
         self.log.rewind(self.step)
         # Last, since rebuilding the rest may draw random numbers.

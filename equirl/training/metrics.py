@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import csv
 import importlib.util
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from equirl.config import Config, ConfigError, flatten, write_atomically
 
-__all__ = ["MetricsLog"]
+__all__ = ["Averages", "MetricsLog"]
 
 Row = Mapping[str, float | int]
 
@@ -61,6 +61,38 @@ class MetricsLog:
         for tracker in self.trackers:
             finish = getattr(tracker.experiment, "finish", None) or tracker.experiment.close
             finish()
+
+
+class Averages:
+    """Means of metrics over the updates since the last reading.
+
+    Args:
+        names: What there is to average.
+    """
+
+    def __init__(self, names: Iterable[str]):
+        self._sums = dict.fromkeys(names, 0.0)
+        self._count = 0
+
+    def add(self, metrics: Mapping[str, float]) -> None:
+        """Takes one update into the means."""
+        self._count += 1
+        for name in self._sums:
+            self._sums[name] += metrics[name]
+
+    def read(self) -> dict[str, float]:
+        """The means, 0 without updates; starts anew."""
+        means = {name: total / max(self._count, 1) for name, total in self._sums.items()}
+        self.load_state_dict({"sums": dict.fromkeys(self._sums, 0.0), "count": 0})
+        return means
+
+    def state_dict(self) -> dict[str, Any]:
+        """Sums and their count."""
+        return {"sums": dict(self._sums), "count": self._count}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what `state_dict` returned."""
+        self._sums, self._count = dict(state["sums"]), state["count"]
 
 
 def _step_of(line: str) -> float:

@@ -7,8 +7,7 @@ from pathlib import Path
 from equirl.analysis import read_table
 from equirl.analysis.curves import plot_run
 from equirl.config import Config
-
-from .evaluation import Evaluation
+from equirl.training.evaluation import Evaluation
 
 __all__ = ["write_report"]
 

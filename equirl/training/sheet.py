@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from equirl.envs import ManipulationEnv
-
-from .video import COLORS, EXPONENT, Frame
+from equirl.training.video import COLORS, EXPONENT, Frame
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -50,6 +50,6 @@ class Stopwatch:
         return {"seconds": dict(self.seconds), "calls": dict(self.calls)}
 
     def load_state_dict(self, state: dict[str, dict[str, float]]) -> None:
-        """Restores what :meth:`state_dict` returned."""
+        """Restores what `state_dict` returned."""
         self.seconds = dict(state["seconds"])
         self.calls = {name: int(count) for name, count in state["calls"].items()}

@@ -8,13 +8,12 @@ from dataclasses import asdict
 from pathlib import Path
 
 from equirl.config import Config
-
-from .evaluation import Evaluation
-from .folder import claim_folder, prepare_folder, stop_on_interrupt
-from .loop import TrainingRun, make_run_env
-from .report import write_report
-from .seeding import Purpose, scene_seed
-from .video import film_policy
+from equirl.training.evaluation import Evaluation
+from equirl.training.folder import claim_folder, prepare_folder, stop_on_interrupt
+from equirl.training.loop import TrainingRun, make_run_env
+from equirl.training.report import write_report
+from equirl.training.seeding import Purpose, scene_seed
+from equirl.training.video import film_policy
 
 __all__ = ["train", "write_episodes"]
 

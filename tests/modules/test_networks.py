@@ -302,5 +302,5 @@ def test_wider_heads_leave_the_encoder_alone_and_values_invariant():
     turned["action"] = action[:, [0, 2, 1, 3, 4]] * torch.tensor([1, -1, -1, 1, -1])
     values = [critic(x)["state_action_value"] for x in (data, turned)]
     torch.testing.assert_close(values[0], values[1], atol=1e-9, rtol=0)
-    with pytest.raises(ValueError, match="head width=0"):
+    with pytest.raises(ValueError, match="head_width=0"):
         make_critic("D4", hidden=8, image_size=16, head_width=0)

@@ -41,7 +41,7 @@ def networks(mode: str = "strict"):
 
 
 def make_loss(actor, critic) -> SACLoss:
-    loss = SACLoss(actor, critic, alpha=ALPHA, target_entropy=TARGET_ENTROPY, gamma=GAMMA)
+    loss = SACLoss(actor, critic, alpha_init=ALPHA, target_entropy=TARGET_ENTROPY, gamma=GAMMA)
     SoftUpdate(loss, tau=TAU)
     return loss
 

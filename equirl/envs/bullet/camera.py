@@ -15,6 +15,8 @@ from equirl.envs.objects.bodies import Color
 from equirl.envs.scene import Area, Scene
 from equirl.envs.workspace import Workspace
 
+__all__ = ["Camera"]
+
 _WALL_COLOR: Color = (0.55, 0.65, 0.75, 1.0)
 _FINGER_COLOR: Color = (0.25, 0.26, 0.30, 1.0)
 _WALL_THICKNESS = 0.008  # m
@@ -27,11 +29,11 @@ class Camera:
     The first one stays free of meshes (fast) and does not notice that pictures are taken.
 
     Args:
-        bodies: as for `Simulation`.
-        areas: the squares that the task marks, in the order of `Scene.areas`.
-        robot: as for `Simulation`; None: neither robot nor walls are shown.
-        workspace: as for `Simulation`.
-        view: where pictures are taken from.
+        bodies: As for `Simulation`.
+        areas: The squares that the task marks, in the order of `Scene.areas`.
+        robot: As for `Simulation`; None: neither robot nor walls are shown.
+        workspace: As for `Simulation`.
+        view: Where pictures are taken from.
     """
 
     def __init__(
@@ -64,10 +66,10 @@ class Camera:
         """Returns the picture of a state.
 
         Args:
-            joints: values of all joints of the robot, shape (J,).
-            scene: as `Simulation.scene` returns it.
-            width: pixels.
-            height: pixels.
+            joints: Values of all joints of the robot, shape (J,).
+            scene: As `Simulation.scene` returns it.
+            width: Pixels.
+            height: Pixels.
 
         Returns:
             Red, green, blue, shape (height, width, 3), uint8.

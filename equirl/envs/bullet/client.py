@@ -6,6 +6,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+__all__ = ["Client", "panda_urdf"]
+
 
 class Client:
     """PyBullet's functions bound to a simulation of our own; the connection is made here.

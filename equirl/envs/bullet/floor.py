@@ -12,6 +12,8 @@ from equirl.envs.objects import ObjectSet
 from equirl.envs.scene import Area, Scene
 from equirl.envs.workspace import Workspace
 
+__all__ = ["Background", "Floor", "Viewpoint"]
+
 _FLOOR_COLOR = (0.80, 0.77, 0.70)
 _LINE_COLOR = (0.72, 0.69, 0.62)
 _AREA_COLOR = (0.35, 0.75, 0.45)
@@ -31,9 +33,9 @@ class Viewpoint:
     """Where a picture is taken from.
 
     Attributes:
-        eye: m.
-        target: a point in the middle of the picture, m.
-        angle: between its lower and its upper edge, degrees.
+        eye: M.
+        target: A point in the middle of the picture, m.
+        angle: Between its lower and its upper edge, degrees.
     """
 
     eye: tuple[float, float, float]
@@ -66,9 +68,9 @@ class Background:
     """A picture of the floor alone.
 
     Attributes:
-        table: colours of the table, shape (height, width, 3), uint8.
-        inside: which pixels show the bin's floor, shape (height, width).
-        texel: the texture's pixels that these show, as indices into its rows, shape (P,).
+        table: Colours of the table, shape (height, width, 3), uint8.
+        inside: Which pixels show the bin's floor, shape (height, width).
+        texel: The texture's pixels that these show, as indices into its rows, shape (P,).
     """
 
     table: np.ndarray
@@ -88,8 +90,8 @@ class Floor:
     A square of the grid is as wide as one action moves the gripper. Light falls straight down.
 
     Args:
-        areas: the squares to mark, in the order of `Scene.areas`.
-        workspace: where the bin is.
+        areas: The squares to mark, in the order of `Scene.areas`.
+        workspace: Where the bin is.
     """
 
     def __init__(self, areas: tuple[Area, ...], workspace: Workspace):
@@ -117,9 +119,9 @@ class Floor:
         """Returns the bin's floor from above, shape (N, N, 3), uint8; indices grow with x and y.
 
         Args:
-            scene: what lies on it and hangs over it.
-            bodies: what scenes are made of, by name.
-            hand: whether the robot's hand casts a shadow.
+            scene: What lies on it and hangs over it.
+            bodies: What scenes are made of, by name.
+            hand: Whether the robot's hand casts a shadow.
         """
         colors = self._bare.copy()
         for area, (x, y, yaw) in zip(self._areas, scene.areas.tolist(), strict=True):

@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
+__all__ = ["hand_joints", "panda_joints", "panda_yaw"]
+
 # Panda's dimensions (m), from its description.
 _SHOULDER_HEIGHT = 0.333
 _UPPER_ARM = (0.316, 0.0825)  # along the link, sideways at the elbow
@@ -24,15 +26,15 @@ def panda_joints(positions: np.ndarray, yaws: np.ndarray, base_x: float) -> np.n
     """Returns the seven joint angles that put the end effector at given poses.
 
     Args:
-        positions: end effector positions, shape (n, 3), m.
-        yaws: angles of the finger axis, shape (n,), rad, unbounded.
-        base_x: x of the arm's base, m (its y and z are 0).
+        positions: End effector positions, shape (n, 3), m.
+        yaws: Angles of the finger axis, shape (n,), rad, unbounded.
+        base_x: X of the arm's base, m (its y and z are 0).
 
     Returns:
         Joint angles, shape (n, 7), rad.
 
     Raises:
-        ValueError: if a position is out of the arm's reach.
+        ValueError: If a position is out of the arm's reach.
     """
     upper, forearm = np.hypot(*_UPPER_ARM), np.hypot(*_FOREARM)
     x, y, z = positions[:, 0] - base_x, positions[:, 1], positions[:, 2]

@@ -10,13 +10,15 @@ import numpy as np
 from equirl.envs.bullet.client import Client
 from equirl.envs.objects import Body, ConvexPolyhedron, ObjectSet
 
+__all__ = ["BodyLoader", "load_picture"]
+
 
 class BodyLoader:
     """Makes bodies in a world; keeps what it writes for that until it is closed.
 
     Args:
-        client: where to.
-        bodies: the bodies, by name.
+        client: Where to.
+        bodies: The bodies, by name.
     """
 
     def __init__(self, client: Client, bodies: ObjectSet):
@@ -40,8 +42,8 @@ class BodyLoader:
         """Returns the id of a new body at rest.
 
         Args:
-            name: which.
-            scale: its size relative to the body of that name; its mass is the same.
+            name: Which.
+            scale: Its size relative to the body of that name; its mass is the same.
             pose: (x, y, z, qx, qy, qz, qw), m, shape (7,).
         """
         client, body = self._client, self._bodies[name]
@@ -80,9 +82,9 @@ class BodyLoader:
         memory when it is given the corners of one.
 
         Args:
-            label: names the pieces: others must have another.
-            pieces: the pieces.
-            scale: enlarges them about the origin.
+            label: Names the pieces: others must have another.
+            pieces: The pieces.
+            scale: Enlarges them about the origin.
         """
         path = Path(self._folder.name) / f"{label}.obj"
         if not path.exists():

@@ -15,6 +15,8 @@ from equirl.envs.bullet.client import Client, panda_urdf
 from equirl.envs.bullet.kinematics import hand_joints, panda_joints, panda_yaw
 from equirl.envs.workspace import Workspace
 
+__all__ = ["RobotLoader", "RobotModel", "robot_model"]
+
 _HAND_LINKS = ("panda_hand", "panda_leftfinger", "panda_rightfinger", "panda_grasptarget")
 _HAND_JOINTS = ("panda_finger_joint1", "panda_finger_joint2", "panda_grasptarget_hand")
 
@@ -24,11 +26,11 @@ class RobotModel:
     """How to build a robot and how its joints give a pose.
 
     Attributes:
-        joint_names: actuated joints that carry the hand.
-        base_x: x of the base, m.
+        joint_names: Actuated joints that carry the hand.
+        base_x: X of the base, m.
         joints: (positions (n, 3), yaws (n,)) -> joint values (n, J).
-        yaw: joint values (J,) -> yaw, rad, unbounded.
-        derive: edits the Panda's description in place.
+        yaw: Joint values (J,) -> yaw, rad, unbounded.
+        derive: Edits the Panda's description in place.
     """
 
     joint_names: tuple[str, ...]
@@ -63,9 +65,9 @@ class RobotLoader:
     """Loads a robot into worlds; its description is derived once.
 
     Args:
-        client: where to.
-        model: which robot.
-        visual: keep the meshes that a picture needs; they make every picture of PyBullet slow and
+        client: Where to.
+        model: Which robot.
+        visual: Keep the meshes that a picture needs; they make every picture of PyBullet slow and
             physics does not use them.
     """
 

@@ -9,6 +9,18 @@ import numpy as np
 from equirl.envs.bullet.client import Client
 from equirl.envs.bullet.models import RobotLoader
 
+__all__ = [
+    "ARM_FORCE",
+    "FINGER_FRICTION",
+    "FINGER_SPEED",
+    "FORCE_LIMIT",
+    "GRIPPER_FORCE",
+    "MAX_GRIP_STEPS",
+    "MIN_GRIP_STEPS",
+    "MOVE_STEPS",
+    "Robot",
+]
+
 ARM_FORCE = 240.0  # N or N m
 GRIPPER_FORCE = 10.0  # N, each finger
 FINGER_FRICTION = 1.0
@@ -28,10 +40,10 @@ class Robot:
     """Drives one robot.
 
     Args:
-        client: the simulation it is loaded into.
-        loader: loads it, and knows which robot it is.
-        time_step: length of a simulation step, s.
-        max_aperture: aperture of the open gripper, m.
+        client: The simulation it is loaded into.
+        loader: Loads it, and knows which robot it is.
+        time_step: Length of a simulation step, s.
+        max_aperture: Aperture of the open gripper, m.
     """
 
     def __init__(self, client: Client, loader: RobotLoader, time_step: float, max_aperture: float):
@@ -99,9 +111,9 @@ class Robot:
         Stops short when it meets a resistance of more than `FORCE_LIMIT` that does not give way.
 
         Args:
-            position: where to, shape (3,), m.
-            yaw: final yaw, rad.
-            step: advances the simulation by one step.
+            position: Where to, shape (3,), m.
+            yaw: Final yaw, rad.
+            step: Advances the simulation by one step.
         """
         start, start_yaw, _ = self.pose()
         positions = start + self._profile[:, None] * (position - start)

@@ -14,6 +14,8 @@ from equirl.envs.objects import ConvexPolyhedron, ObjectSet
 from equirl.envs.scene import Scene
 from equirl.envs.workspace import Bin, Workspace
 
+__all__ = ["SOLVER_ITERATIONS", "TIME_STEP", "Simulation"]
+
 TIME_STEP = 1 / 120
 SOLVER_ITERATIONS = 20
 # Contact normals with a smaller vertical part count as lateral, distances below this as touching.
@@ -34,9 +36,9 @@ class Simulation:
     order of its sums otherwise.
 
     Args:
-        bodies: what scenes are made of, by name.
+        bodies: What scenes are made of, by name.
         robot: ``"panda"`` or ``"hand"``.
-        workspace: dimensions of the cell.
+        workspace: Dimensions of the cell.
     """
 
     def __init__(self, bodies: ObjectSet, robot: str, workspace: Workspace):
@@ -82,10 +84,10 @@ class Simulation:
         """Puts everything at rest into ``scene``, in a world made anew.
 
         Args:
-            scene: a state of bodies of this simulation.
+            scene: A state of bodies of this simulation.
 
         Raises:
-            ValueError: if it has others.
+            ValueError: If it has others.
         """
         scene = scene.named(self._bodies)
         self._make_world()
@@ -114,8 +116,8 @@ class Simulation:
         """Returns ``scene`` with its objects come to rest, the robot out of their way.
 
         Args:
-            scene: where the objects start; its gripper is kept.
-            one_by_one: let each fall when those before it lie still.
+            scene: Where the objects start; its gripper is kept.
+            one_by_one: Let each fall when those before it lie still.
         """
         scene = scene.named(self._bodies)
         self._make_world()
@@ -145,9 +147,9 @@ class Simulation:
         """Moves the end effector, then the gripper.
 
         Args:
-            position: where to, shape (3,), m.
-            yaw: final yaw, rad.
-            aperture: final aperture, m.
+            position: Where to, shape (3,), m.
+            yaw: Final yaw, rad.
+            aperture: Final aperture, m.
         """
         self._robot.move(position, yaw, self._client.stepSimulation)
         self._robot.grip(aperture, self._client.stepSimulation)

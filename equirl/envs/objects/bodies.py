@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull, QhullError
 
+__all__ = ["Body", "ConvexPolyhedron", "cube"]
+
 Color = tuple[float, float, float, float]
 
 _RED: Color = (0.85, 0.25, 0.2, 1.0)
@@ -21,10 +23,10 @@ class ConvexPolyhedron:
     """A convex polyhedron.
 
     Attributes:
-        vertices: corner points, shape (V, 3), m.
-        triangles: rows of three vertex indices covering the surface, shape (T, 3), in
+        vertices: Corner points, shape (V, 3), m.
+        triangles: Rows of three vertex indices covering the surface, shape (T, 3), in
             counter-clockwise order as seen from outside.
-        half_extents: half sides (3,), m, when it is a box about the origin along the axes: boxes
+        half_extents: Half sides (3,), m, when it is a box about the origin along the axes: boxes
             collide faster and more stably than general hulls. Else None.
     """
 
@@ -37,7 +39,7 @@ class ConvexPolyhedron:
         """Returns the convex hull of ``points`` (shape (P, 3), m).
 
         Raises:
-            ValueError: if the points are not finite or span no volume.
+            ValueError: If the points are not finite or span no volume.
         """
         points = np.asarray(points, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
@@ -88,13 +90,13 @@ class Body:
     overlap, mass counts twice.
 
     Attributes:
-        pieces: its geometry in the body's frame; collides, and is drawn.
-        mass: kg.
-        friction: lateral friction coefficient.
-        name: what it is called.
-        rolling_friction: torsional friction against rolling, m; keeps round bodies from rolling
+        pieces: Its geometry in the body's frame; collides, and is drawn.
+        mass: Kg.
+        friction: Lateral friction coefficient.
+        name: What it is called.
+        rolling_friction: Torsional friction against rolling, m; keeps round bodies from rolling
             for ever.
-        color: red, green, blue, alpha in [0, 1], for `ManipulationEnv.render` only.
+        color: Red, green, blue, alpha in [0, 1], for `ManipulationEnv.render` only.
     """
 
     pieces: tuple[ConvexPolyhedron, ...]

@@ -8,6 +8,8 @@ import numpy as np
 
 from equirl.envs.objects.bodies import Body, ConvexPolyhedron
 
+__all__ = ["bowl"]
+
 _WALL = 0.007  # thickness of the wall, m; a finger moves 4 mm at most in a simulation step
 # Outline of the outside, from the foot to the rim: (distance of the flats from the axis, height),
 # in units of half the width and of the height. The wall is steep below the rim, so that a gripper
@@ -24,10 +26,10 @@ def bowl(width: float, height: float, mass: float, friction: float) -> Body:
     eight slabs. It is symmetric under quarter turns and reflections, bit for bit.
 
     Args:
-        width: between opposite flats of the rim, m.
-        height: m.
-        mass: kg.
-        friction: lateral friction coefficient.
+        width: Between opposite flats of the rim, m.
+        height: M.
+        mass: Kg.
+        friction: Lateral friction coefficient.
     """
     half = width / 2
     foot = np.concatenate(

@@ -23,6 +23,17 @@ from equirl.envs.objects.bodies import ConvexPolyhedron
 if TYPE_CHECKING:
     from trimesh import Trimesh
 
+__all__ = [
+    "LONGEST_SIDE",
+    "SHORTEST_SIDE",
+    "MeshError",
+    "PieceCache",
+    "box_sides",
+    "convex_pieces",
+    "require_libraries",
+    "sides_text",
+]
+
 LONGEST_SIDE = 0.20  # m
 SHORTEST_SIDE = 0.008  # m; what is thinner slips between the fingertips and the table
 
@@ -76,7 +87,7 @@ def convex_pieces(file: Path, max_pieces: int, cache: PieceCache) -> Pieces:
     """Returns the convex pieces of the mesh in ``file``, in its units.
 
     Raises:
-        MeshError: if the file is no mesh of a solid.
+        MeshError: If the file is no mesh of a solid.
     """
     try:
         data = file.read_bytes()
@@ -121,7 +132,7 @@ def _read_mesh(data: bytes, suffix: str) -> tuple[Trimesh, float]:
     """Returns the mesh in ``data``, of longest side 1 about the origin, and its longest side.
 
     Raises:
-        MeshError: if it is no mesh, or so flat that no size of it could be grasped.
+        MeshError: If it is no mesh, or so flat that no size of it could be grasped.
     """
     import trimesh
 
@@ -196,7 +207,7 @@ def _decompose(parts: Sequence[tuple[Trimesh, int]]) -> Pieces:
     """Returns the convex pieces of ``parts``, each given with the most pieces it may have.
 
     Raises:
-        MeshError: if coacd fails.
+        MeshError: If coacd fails.
     """
     pieces: Pieces = []
     left = []

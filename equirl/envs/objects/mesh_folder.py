@@ -25,6 +25,8 @@ from equirl.envs.objects.convex_pieces import (
 )
 from equirl.envs.objects.object_set import ObjectSet
 
+__all__ = ["NATURAL_SIDE", "SUFFIXES", "MeshFolder"]
+
 SUFFIXES = (".obj", ".stl")
 
 NATURAL_SIDE = 0.09  # m; the longest side given to a mesh of unknown units
@@ -60,24 +62,24 @@ class MeshFolder(ObjectSet):
     should not matter.
 
     Args:
-        path: the folder; folders in it are not looked into.
-        mass: of each body, kg.
-        friction: lateral friction coefficient.
-        rolling_friction: torsional friction against rolling, m.
-        max_grasp_width: the widest middle side allowed, m; the gripper opens 0.08 m.
-        scale: metres per unit of the files. With None, each mesh is scaled by itself, as the units
+        path: The folder; folders in it are not looked into.
+        mass: Of each body, kg.
+        friction: Lateral friction coefficient.
+        rolling_friction: Torsional friction against rolling, m.
+        max_grasp_width: The widest middle side allowed, m; the gripper opens 0.08 m.
+        scale: Metres per unit of the files. With None, each mesh is scaled by itself, as the units
             of mesh files are unknown: to a longest side of 9 cm, or less when the middle side would
             exceed ``max_grasp_width``.
-        max_pieces: the most convex pieces per body; fewer are faster to simulate, and close hollows
+        max_pieces: The most convex pieces per body; fewer are faster to simulate, and close hollows
             and holes sooner.
-        cache: folder of the divided meshes; with None ``$XDG_CACHE_HOME/equirl/meshes``, or
+        cache: Folder of the divided meshes; with None ``$XDG_CACHE_HOME/equirl/meshes``, or
             ``~/.cache/equirl/meshes``. May be shared by processes and deleted at any time.
-        skip_refused: leave out, with a warning in the log, meshes that cannot be used.
+        skip_refused: Leave out, with a warning in the log, meshes that cannot be used.
 
     Raises:
-        MeshError: if the folder has no meshes, or some cannot be used; it names them all.
-        ImportError: if trimesh or coacd is not installed.
-        ValueError: if an argument is out of its range.
+        MeshError: If the folder has no meshes, or some cannot be used; it names them all.
+        ImportError: If trimesh or coacd is not installed.
+        ValueError: If an argument is out of its range.
     """
 
     def __init__(
@@ -147,7 +149,7 @@ def _mesh_files(folder: Path) -> list[Path]:
     """Returns the mesh files of ``folder`` by name; hidden files are none.
 
     Raises:
-        MeshError: if there is no such folder, no mesh in it, or two of one name.
+        MeshError: If there is no such folder, no mesh in it, or two of one name.
     """
     expected = f"expected a folder of {' and '.join(SUFFIXES)} files"
     if not folder.exists():
@@ -172,7 +174,7 @@ def _report(folder: Path, loaded: Mapping[Path, Pieces | MeshError], skip: bool)
     """Logs the refused files if they are to be skipped and others remain.
 
     Raises:
-        MeshError: otherwise, with the reason for each.
+        MeshError: Otherwise, with the reason for each.
     """
     refused = {file: error for file, error in loaded.items() if isinstance(error, MeshError)}
     if len(refused) == len(loaded) or (refused and not skip):
@@ -189,7 +191,7 @@ def _scaled(pieces: Pieces, scale: float | None, max_grasp_width: float) -> Piec
     """Returns ``pieces`` (in the file's units) in metres.
 
     Raises:
-        MeshError: if the gripper could not grasp them.
+        MeshError: If the gripper could not grasp them.
     """
     given = box_sides(np.concatenate(pieces))
     factor = min(NATURAL_SIDE / given[2], max_grasp_width / given[1]) if scale is None else scale

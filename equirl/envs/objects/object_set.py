@@ -7,16 +7,18 @@ from collections.abc import Iterable, Iterator, Mapping
 
 from equirl.envs.objects.bodies import Body
 
+__all__ = ["ObjectSet"]
+
 
 class ObjectSet(Mapping[str, Body]):
     """Bodies that scenes are drawn from, by name and in a fixed order.
 
     Args:
-        bodies: the bodies; their names must differ.
-        source: what the set is called in messages.
+        bodies: The bodies; their names must differ.
+        source: What the set is called in messages.
 
     Raises:
-        ValueError: if there is no body, or two have one name.
+        ValueError: If there is no body, or two have one name.
     """
 
     def __init__(self, bodies: Iterable[Body], source: str):
@@ -55,6 +57,6 @@ class ObjectSet(Mapping[str, Body]):
         """Returns the set of the bodies with these ``names``, in the order given.
 
         Raises:
-            KeyError: if there is no such body.
+            KeyError: If there is no such body.
         """
         return ObjectSet((self[name] for name in names), f"a part of {self.source}")

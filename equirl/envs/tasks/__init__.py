@@ -46,11 +46,11 @@ def find_task(name: str | type[Task]) -> type[Task]:
     """Returns the class of a task.
 
     Args:
-        name: one of `TASKS`, ``"package.module:Class"`` for a task defined elsewhere, or the class
+        name: One of `TASKS`, ``"package.module:Class"`` for a task defined elsewhere, or the class
             itself.
 
     Raises:
-        ValueError: if there is no such task.
+        ValueError: If there is no such task.
     """
     task: Any = TASKS.get(name, name) if isinstance(name, str) else name
     if isinstance(task, str):
@@ -72,11 +72,11 @@ def make_task(task: str | type[Task], **options: Any) -> Task:
     """Returns a task with numbers of one's own.
 
     Args:
-        task: as for `find_task`.
-        options: numbers of the task, by the names of its attributes.
+        task: As for `find_task`.
+        options: Numbers of the task, by the names of its attributes.
 
     Raises:
-        ValueError: if there is none, or it has no such option or not such a value; the message
+        ValueError: If there is none, or it has no such option or not such a value; the message
             lists the names.
     """
     kind = find_task(task)

@@ -15,6 +15,8 @@ from equirl.envs.objects import Body, ObjectSet
 from equirl.envs.scene import Area, Scene
 from equirl.envs.workspace import Workspace
 
+__all__ = ["WORKSPACE", "PlacementError", "State", "Task", "lying", "rejection_sample"]
+
 _BATCH = 256  # points drawn at a time
 WORKSPACE = Workspace()  # what numbers of a task are measured against
 
@@ -28,9 +30,9 @@ class State:
     """What is judged at the end of a step.
 
     Attributes:
-        scene: the measured poses.
-        held: index of the object that the fingers squeeze, or None.
-        touching: tells whether the objects of two indices touch each other.
+        scene: The measured poses.
+        held: Index of the object that the fingers squeeze, or None.
+        touching: Tells whether the objects of two indices touch each other.
     """
 
     scene: Scene
@@ -45,11 +47,11 @@ class Task(ABC):
     The fields of a task are its numbers (m, kg, rad), checked at construction.
 
     Attributes:
-        view: length of a side of the depth image, m.
-        margin: an object that is not held and leaves the workspace by more than this (m) ends the
+        view: Length of a side of the depth image, m.
+        margin: An object that is not held and leaves the workspace by more than this (m) ends the
             episode.
-        start_half_width: positions are drawn within +-this of the centre, m.
-        placement_tries: draws of a scene before `PlacementError`.
+        start_half_width: Positions are drawn within +-this of the centre, m.
+        placement_tries: Draws of a scene before `PlacementError`.
     """
 
     view: float = 0.30
@@ -78,14 +80,14 @@ class Task(ABC):
         """Draws a new scene.
 
         Args:
-            rng: the only source of randomness.
-            home: the robot at the start of an episode, without objects.
+            rng: The only source of randomness.
+            home: The robot at the start of an episode, without objects.
 
         Returns:
             ``home`` with objects and areas.
 
         Raises:
-            PlacementError: if they do not fit.
+            PlacementError: If they do not fit.
         """
 
     @abstractmethod
@@ -101,9 +103,9 @@ class Task(ABC):
         """Returns what the next episode of the same scene starts with.
 
         Args:
-            state: the end of the last episode.
-            succeeded: whether that was a success.
-            episodes: episodes played on this scene so far.
+            state: The end of the last episode.
+            succeeded: Whether that was a success.
+            episodes: Episodes played on this scene so far.
 
         Returns:
             The scene (its gripper is sent home), or None for a new scene: the default.
@@ -151,17 +153,17 @@ def rejection_sample(
     """Returns the first of uniformly drawn points that is accepted.
 
     Args:
-        rng: the only source of randomness.
-        half_widths: coordinate k is drawn within +-``half_widths[k]``, D of them.
-        accept: tells of points (N, D) which are accepted, (N,).
-        tries: how many are drawn at most.
-        what: what is looked for, for the message.
+        rng: The only source of randomness.
+        half_widths: Coordinate k is drawn within +-``half_widths[k]``, D of them.
+        accept: Tells of points (N, D) which are accepted, (N,).
+        tries: How many are drawn at most.
+        what: What is looked for, for the message.
 
     Returns:
         The point, shape (D,).
 
     Raises:
-        PlacementError: if none of ``tries`` points is accepted.
+        PlacementError: If none of ``tries`` points is accepted.
     """
     wide = np.asarray(half_widths)
     for start in range(0, tries, _BATCH):

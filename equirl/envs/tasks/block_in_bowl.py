@@ -15,21 +15,23 @@ from equirl.envs.scene import Scene
 from equirl.envs.tasks.base import State, lying
 from equirl.envs.tasks.block_task import BlockTask
 
+__all__ = ["BlockInBowl", "BlockInBowlExpert", "tilt"]
+
 
 @dataclass(frozen=True, kw_only=True)
 class BlockInBowl(BlockTask):
     """A cube and a bowl lie in the bin; success is the cube in the upright bowl, released.
 
     Attributes:
-        bowl_width: width of the bowl between opposite flats of its rim, m.
-        bowl_height: m.
-        bowl_mass: kg.
-        bowl_friction: lateral friction.
-        bowl_half_width: the bowl's centre is drawn within +-this of the bin's, m.
-        bowl_distance: least distance of the centres of cube and bowl at the start, m.
-        reach: greatest distance of the two centres, in x and y, that is a success, m.
-        max_tilt: greatest angle between the bowl's axis and the vertical, rad.
-        require_release: whether a cube that is still held is no success yet.
+        bowl_width: Width of the bowl between opposite flats of its rim, m.
+        bowl_height: M.
+        bowl_mass: Kg.
+        bowl_friction: Lateral friction.
+        bowl_half_width: The bowl's centre is drawn within +-this of the bin's, m.
+        bowl_distance: Least distance of the centres of cube and bowl at the start, m.
+        reach: Greatest distance of the two centres, in x and y, that is a success, m.
+        max_tilt: Greatest angle between the bowl's axis and the vertical, rad.
+        require_release: Whether a cube that is still held is no success yet.
     """
 
     view: float = 0.45

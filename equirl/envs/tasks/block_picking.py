@@ -13,13 +13,15 @@ from equirl.envs.scene import Scene
 from equirl.envs.tasks.base import WORKSPACE, State, lying
 from equirl.envs.tasks.block_task import BlockTask
 
+__all__ = ["BlockPicking", "BlockPickingExpert"]
+
 
 @dataclass(frozen=True, kw_only=True)
 class BlockPicking(BlockTask):
     """A cube lies in the bin; success is holding it with the gripper high enough.
 
     Attributes:
-        lift_height: the end effector must be above this, m.
+        lift_height: The end effector must be above this, m.
     """
 
     lift_height: float = 0.15

@@ -13,18 +13,20 @@ from equirl.envs.scene import Area, Scene
 from equirl.envs.tasks.base import State
 from equirl.envs.tasks.block_task import BlockTask
 
+__all__ = ["BlockPushing", "BlockPushingExpert"]
+
 
 @dataclass(frozen=True, kw_only=True)
 class BlockPushing(BlockTask):
     """A cube lies in the bin beside a goal area; success is the cube in it, not held.
 
     Attributes:
-        goal_side: side of the goal area, m.
-        goal_raise: height added to the goal area in the depth image, m.
-        goal_half_width: the goal's centre is drawn within +-this of the bin's, m.
-        goal_distance: least distance from the cube's centre to the goal's at the start, m.
-        reach: greatest distance of the two centres, in x and y, that is a success, m.
-        max_height: the cube's centre must be below this, m.
+        goal_side: Side of the goal area, m.
+        goal_raise: Height added to the goal area in the depth image, m.
+        goal_half_width: The goal's centre is drawn within +-this of the bin's, m.
+        goal_distance: Least distance from the cube's centre to the goal's at the start, m.
+        reach: Greatest distance of the two centres, in x and y, that is a success, m.
+        max_height: The cube's centre must be below this, m.
     """
 
     view: float = 0.45
@@ -93,9 +95,8 @@ class BlockPushingExpert(Expert):
         yaw = np.arctan2(direction[1], direction[0]) + np.pi / 2
         yaw = nearest_symmetric_yaw(yaw, scene.yaw, np.pi)
         height = scene.position[2]
-        start = self.env.workspace.clip(np.array([*(cube[:2] - self._behind * direction), height]))[
-            :2
-        ]
+        behind = np.array([*(cube[:2] - self._behind * direction), height])
+        start = self.env.workspace.clip(behind)[:2]
         offset = scene.position[:2] - cube[:2]
         along, across = offset @ direction, offset @ (-direction[1], direction[0])
         low = height < (self._travel_height + self._push_height) / 2

@@ -10,16 +10,18 @@ import numpy as np
 from equirl.envs.objects import Body, cube
 from equirl.envs.tasks.base import WORKSPACE, Task, lying, rejection_sample
 
+__all__ = ["BlockTask"]
+
 
 @dataclass(frozen=True, kw_only=True)
 class BlockTask(Task):
     """A task with a cube that lies somewhere in the bin.
 
     Attributes:
-        cube_side: m.
-        cube_mass: kg.
-        cube_friction: lateral friction.
-        start_yaw: the cube's yaw is drawn within +-this, rad.
+        cube_side: M.
+        cube_mass: Kg.
+        cube_friction: Lateral friction.
+        start_yaw: The cube's yaw is drawn within +-this, rad.
     """
 
     cube_side: float = 0.05
@@ -49,16 +51,16 @@ class BlockTask(Task):
         """Draws the cube's pose and a point at a distance from it.
 
         Args:
-            rng: the only source of randomness.
-            half_width: the point is drawn within +-this, m.
-            distance: the least distance of cube and point, m.
-            what: what the point is, for the message.
+            rng: The only source of randomness.
+            half_width: The point is drawn within +-this, m.
+            distance: The least distance of cube and point, m.
+            what: What the point is, for the message.
 
         Returns:
             The cube's pose, shape (7,), and the point's x and y, shape (2,), m.
 
         Raises:
-            PlacementError: if they do not fit.
+            PlacementError: If they do not fit.
         """
         drawn = rejection_sample(
             rng,

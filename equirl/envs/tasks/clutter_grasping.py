@@ -16,6 +16,8 @@ from equirl.envs.objects import MeshFolder, ObjectSet, household_objects
 from equirl.envs.scene import Scene
 from equirl.envs.tasks.base import WORKSPACE, State, Task
 
+__all__ = ["ClutterGrasping", "ClutterGraspingExpert"]
+
 # The robot waits 0.45 m high; the largest objects reach 0.1 m from their centres.
 _HIGHEST_DROP = 0.35  # m
 
@@ -29,14 +31,14 @@ class ClutterGrasping(Task):
 
     Attributes:
         objects: ``"household"``, the folder of a user's meshes, or an `ObjectSet`.
-        names: the objects of the set to draw from; empty: all.
-        object_count: objects of a new scene, drawn with replacement.
-        smallest_scale: the size of each object is drawn from this ...
+        names: The objects of the set to draw from; empty: all.
+        object_count: Objects of a new scene, drawn with replacement.
+        smallest_scale: The size of each object is drawn from this ...
         largest_scale: ... to this, relative to the set's.
-        drop_height: objects are dropped from here, one by one, m.
-        start_yaw: yaws are drawn within +-this, rad.
-        lift_height: the end effector must be above this, m.
-        max_scene_episodes: a scene is given up after so many episodes, of which each reset begins
+        drop_height: Objects are dropped from here, one by one, m.
+        start_yaw: Yaws are drawn within +-this, rad.
+        lift_height: The end effector must be above this, m.
+        max_scene_episodes: A scene is given up after so many episodes, of which each reset begins
             one; 0: never.
     """
 

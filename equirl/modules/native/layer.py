@@ -13,11 +13,11 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.autograd.function import once_differentiable
 
-from ..fields import FieldType
-from ..filters import expanded_filter
-from ..steerable import SteerableConv
-from .library import load
-from .spectral import SpectralBasis, plain_tensors, spectral_basis
+from equirl.modules.fields import FieldType
+from equirl.modules.filters import expanded_filter
+from equirl.modules.native.library import load
+from equirl.modules.native.spectral import SpectralBasis, plain_tensors, spectral_basis
+from equirl.modules.steerable import SteerableConv
 
 __all__ = [
     "BLOCK",
@@ -105,7 +105,7 @@ def encode(layers: Sequence[SteerableConv], pools: Sequence[bool], x: Tensor) ->
     Args:
         layers: Supported layers in sequence, the first of trivial fields.
         pools: For each layer whether a 2 x 2 maximum follows.
-        x: Images (B, C, H, W) that :func:`runs` accepts.
+        x: Images (B, C, H, W) that `runs` accepts.
 
     Returns:
         Shape (B, out channels, H', W'), channels in the order of the last layer's fields.
@@ -155,7 +155,7 @@ def to_blocks(x: Tensor, channels: int = 1, block: int = BLOCK) -> Tensor:
 
 
 def from_blocks(x: Tensor, batch: int) -> Tensor:
-    """The inverse of :func:`to_blocks` for a batch of that many maps."""
+    """The inverse of `to_blocks` for a batch of that many maps."""
     return x.permute(0, 5, 1, 4, 2, 3).flatten(2, 3).flatten(0, 1)[:batch]
 
 
@@ -169,8 +169,8 @@ def conv_block(conv: SteerableConv, x: Tensor, pool: bool = False, relu: bool = 
     Args:
         conv: The layer; its parameters are read, possibly swapped in functionally.
         x: Blocks of maps (blocks, fields, H, W, channels, 16 or 1), float32, see
-            :func:`to_blocks`: trivial fields of one channel, or regular fields of the
-            subgroup in the kernels' order, see :func:`channel_order`.
+            `to_blocks`: trivial fields of one channel, or regular fields of the
+            subgroup in the kernels' order, see `channel_order`.
         pool: Whether to take the maximum; the convolution's height and width must be even.
         relu: Whether to apply the ReLU.
 

@@ -39,7 +39,7 @@ class Library:
 
 
 def best_instruction_set() -> str:
-    """The best of :data:`INSTRUCTION_SETS` that this processor has.
+    """The best of `INSTRUCTION_SETS` that this processor has.
 
     By torch's account, whose own kernels ask for the same; ``ATEN_CPU_CAPABILITY`` lowers it.
     """

@@ -24,10 +24,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from equirl.modules.bases import kernel_basis
+from equirl.modules.fields import element_key
 from equirl.symmetry import Element, SymmetryGroup
-
-from ..bases import kernel_basis
-from ..fields import element_key
 
 __all__ = ["SpectralBasis", "plain_tensors", "spectral_basis"]
 

@@ -13,16 +13,18 @@ from equirl.envs.objects.household.solids import (
     turned,
 )
 
+__all__ = ["boot", "camera", "car", "duck"]
+
 
 def boot(length: float, width: float, height: float, shaft: float, heel: float) -> Pieces:
     """A boot standing upright, its toe at +x.
 
     Args:
-        length: of the sole.
-        width: of the sole.
-        height: of the whole.
-        shaft: diameter of the shaft along x.
-        heel: height of the heel.
+        length: Of the sole.
+        width: Of the sole.
+        height: Of the whole.
+        shaft: Diameter of the shaft along x.
+        heel: Height of the heel.
     """
     half = width / 2
     sole = [
@@ -83,14 +85,14 @@ def car(
     """A toy car on its wheels, driving towards +x.
 
     Args:
-        length: of the whole.
-        width: of the whole.
-        wheel: radius of a wheel; the two of an axle are one roller.
-        belt: height of the body.
-        roof: height of the roof.
-        cabin: where the cabin starts and ends at the belt and, between these, at the roof: rear
+        length: Of the whole.
+        width: Of the whole.
+        wheel: Radius of a wheel; the two of an axle are one roller.
+        belt: Height of the body.
+        roof: Height of the roof.
+        cabin: Where the cabin starts and ends at the belt and, between these, at the roof: rear
             below, rear above, front above, front below, as fractions of the length from the back.
-        nose: height of the bonnet's front.
+        nose: Height of the bonnet's front.
     """
     half, floor = width / 2, 0.9 * wheel
     rear, roof_rear, roof_front, front = (part * length for part in cabin)
@@ -118,12 +120,12 @@ def duck(
     """A bath duck, its beak towards +x.
 
     Args:
-        length: of the body with its tail.
-        width: of the body.
-        body: height of the body.
-        head_radius: of the head.
-        height: of the whole.
-        beak: length of the beak.
+        length: Of the body with its tail.
+        width: Of the body.
+        body: Height of the body.
+        head_radius: Of the head.
+        height: Of the whole.
+        beak: Length of the beak.
     """
     half, up = width / 2, body / 2
     sections = [  # x and z of the middle, half width, half height

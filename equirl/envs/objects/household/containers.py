@@ -13,6 +13,8 @@ from equirl.envs.objects.household.solids import (
     turned,
 )
 
+__all__ = ["bottle", "can", "carton", "mug"]
+
 
 def bottle(
     length: float,

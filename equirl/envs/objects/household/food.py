@@ -15,6 +15,8 @@ from equirl.envs.objects.household.solids import (
     turned,
 )
 
+__all__ = ["apple", "banana", "carrot", "croissant", "donut", "egg", "pear"]
+
 
 def apple(radius: float, height: float, widest: float, stem: float, leaf: float = 0.0) -> Pieces:
     """An apple with its stem up, widest at the fraction ``widest`` of its height."""

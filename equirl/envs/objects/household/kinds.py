@@ -9,16 +9,18 @@ from typing import Any
 from equirl.envs.objects.household import belongings, containers, food, tools
 from equirl.envs.objects.household.solids import Pieces
 
+__all__ = ["KINDS", "Kind"]
+
 
 @dataclass(frozen=True)
 class Kind:
     """A kind of object.
 
     Attributes:
-        generate: makes the pieces of an object from the numbers of a variant, cm.
-        hue: of its colours, in [0, 1).
-        saturation: of its colours, in [0, 1].
-        variants: keyword arguments of ``generate``, one row a variant.
+        generate: Makes the pieces of an object from the numbers of a variant, cm.
+        hue: Of its colours, in [0, 1).
+        saturation: Of its colours, in [0, 1].
+        variants: Keyword arguments of ``generate``, one row a variant.
     """
 
     generate: Callable[..., Pieces]

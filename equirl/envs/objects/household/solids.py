@@ -13,6 +13,19 @@ import numpy as np
 
 from equirl.envs.objects.bodies import ConvexPolyhedron
 
+__all__ = [
+    "block",
+    "both_sides",
+    "chain",
+    "hull",
+    "laid",
+    "plate",
+    "prism",
+    "ring",
+    "slab",
+    "turned",
+]
+
 Pieces = list[ConvexPolyhedron]
 
 _PLANES = {"x": (1, 2), "y": (0, 2), "z": (0, 1)}  # the two other axes of each axis
@@ -27,10 +40,10 @@ def ring(
     """Returns the corners of a polygon about an ellipse, shape (sides, 3).
 
     Args:
-        centre: of the ellipse, shape (3,).
-        across: one half axis, shape (3,).
-        up: the other half axis, shape (3,).
-        sides: number of corners, a multiple of four; the ellipse touches the middle of each side,
+        centre: Of the ellipse, shape (3,).
+        across: One half axis, shape (3,).
+        up: The other half axis, shape (3,).
+        sides: Number of corners, a multiple of four; the ellipse touches the middle of each side,
             so that a lying cylinder rests on a flat.
     """
     angles = (np.arange(sides // 4) + 0.5) * 2 * np.pi / sides
@@ -56,10 +69,10 @@ def turned(
 
     Args:
         axis: ``"x"``, ``"y"`` or ``"z"``.
-        profile: rows (position along the axis, radius) or (position, two radii along the other two
+        profile: Rows (position along the axis, radius) or (position, two radii along the other two
             axes in alphabetical order).
-        centre: where the axis passes, in the other two coordinates.
-        sides: corners of a ring.
+        centre: Where the axis passes, in the other two coordinates.
+        sides: Corners of a ring.
     """
     first, second = _PLANES[axis]
     along = "xyz".index(axis)

@@ -12,6 +12,8 @@ from equirl.envs.objects.household.solids import (
     turned,
 )
 
+__all__ = ["flashlight", "hammer", "screwdriver", "wrench"]
+
 
 def flashlight(
     length: float, radius: float, head_radius: float, head: float, flare: float
@@ -43,13 +45,13 @@ def hammer(
     """A two-faced hammer lying flat, its handle along x, its head along y at +x.
 
     Args:
-        length: of the whole.
-        handle_radius: of the handle where it meets the head; it thickens towards its end.
-        head_width: length of the head, along y.
-        head_radius: of the head.
-        face: radius of its faces as a fraction of ``head_radius``.
-        sides: corners of the head's cross-section.
-        rim: how much thicker the ends of the head are.
+        length: Of the whole.
+        handle_radius: Of the handle where it meets the head; it thickens towards its end.
+        head_width: Length of the head, along y.
+        head_radius: Of the head.
+        face: Radius of its faces as a fraction of ``head_radius``.
+        sides: Corners of the head's cross-section.
+        rim: How much thicker the ends of the head are.
     """
     centre = (length - head_radius, 0.0)
     half = head_width / 2
@@ -115,11 +117,11 @@ def wrench(
     """An open-end wrench lying flat along x.
 
     Args:
-        length: of the whole.
-        width: of the handle.
-        thickness: height of the flat.
-        jaw: half width of the jaw at +x.
-        small_jaw: half width of the jaw at -x, if there is one ...
+        length: Of the whole.
+        width: Of the handle.
+        thickness: Height of the flat.
+        jaw: Half width of the jaw at +x.
+        small_jaw: Half width of the jaw at -x, if there is one ...
         ring_radius: ... or the radius of a round end.
     """
     half = length / 2
