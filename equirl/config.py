@@ -6,11 +6,18 @@ import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from difflib import get_close_matches
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, TypeVar, cast
 
 from omegaconf import MISSING, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import (
+    ConfigAttributeError,
+    ConfigKeyError,
+    MissingMandatoryValue,
+    OmegaConfBaseException,
+)
 from yaml import YAMLError
 
 __all__ = ["Config", "ConfigError", "load_config", "register", "save_config", "to_config"]
@@ -23,29 +30,51 @@ class ConfigError(ValueError):
     """A key or value that no run can have; the message names it."""
 
 
+# Where the rooms list what there is to choose from.
+_MODES = "equirl.symmetry.spec:MODES"
+_BACKENDS = "equirl.modules.backend:BACKENDS"
+_ROBOTS = "equirl.envs:ROBOTS"
+_METHODS = "equirl.training.networks:METHODS"
+
+
 def _at_least(default: Any, lowest: float, *, free: bool = False) -> Any:
     """A number from ``lowest`` on."""
-    return _checked(default, lambda value: value >= lowest, f"{lowest} or more", free)
+    return _checked(default, lambda value: value >= lowest, f"{lowest} or more", free=free)
 
 
 def _within(default: float, low: float, high: float) -> Any:
     """A number above ``low``, at most ``high``."""
     expected = f"a number above {low:g}, at most {high:g}"
-    return _checked(default, lambda value: low < value <= high, expected, False)
+    return _checked(default, lambda value: low < value <= high, expected)
 
 
-def _one_of(*allowed: str, free: bool = False) -> Any:
-    """One of several words, by default the first."""
-    expected = f"one of {', '.join(allowed)}"
-    return _checked(allowed[0], lambda value: value in allowed, expected, free)
+def _one_of(default: str, *allowed: str, source: str = "", free: bool = False) -> Any:
+    """One of several words: the default, ``allowed``, or those that ``source`` lists.
+
+    ``source`` is ``"module:name"``, looked up when a value is checked, so that the schema needs
+    none of the libraries behind it; a default of ``MISSING`` is left to the files of ``conf``.
+    """
+
+    def words() -> list[str]:
+        if source:
+            return list(resolve_name(source))
+        return [word for word in (default, *allowed) if word != MISSING]
+
+    return _checked(
+        default,
+        lambda value: value in words(),
+        lambda: f"one of {', '.join(words())}",
+        free=free,
+    )
 
 
-def _name_of(*allowed: str) -> Any:
-    """One of several names, none by default: that is up to a file of ``conf``."""
-    return _checked(MISSING, lambda value: value in allowed, f"one of {', '.join(allowed)}", False)
-
-
-def _checked(default: Any, valid: Callable[[Any], bool], expected: str, free: bool) -> Any:
+def _checked(
+    default: Any,
+    valid: Callable[[Any], bool],
+    expected: str | Callable[[], str],
+    *,
+    free: bool = False,
+) -> Any:
     metadata = {"valid": valid, "expected": expected, "free": free}
     return field(default=default, metadata=metadata)
 
@@ -61,7 +90,7 @@ class EnvConfig:
 
     task: str = MISSING  # a file of equirl/envs/tasks, or "package.module:Class"
     image_size: int = _at_least(128, 2)  # pixels a side; networks take 16, 32, 64, 128 and 256
-    robot: str = _one_of("panda", "hand")  # the arm, or its hand alone, flying freely
+    robot: str = _one_of("panda", source=_ROBOTS)  # or "hand", flying freely
     max_steps: int = _at_least(50, 1)
     options: dict[str, Any] = field(default_factory=dict)  # numbers of the task, see its file
 
@@ -70,7 +99,7 @@ class EnvConfig:
 class MethodConfig:
     """The networks."""
 
-    name: str = _name_of("equivariant", "cnn")
+    name: str = _one_of(MISSING, source=_METHODS)
     hidden: int = _at_least(64, 1)  # width n of the encoder (appendix A); the CNN scales with it
     head_width: int = _at_least(0, 0)  # fields of an equivariant critic head; 0: hidden, as there
 
@@ -79,22 +108,22 @@ class MethodConfig:
 class AlgorithmConfig:
     """Soft actor-critic (appendix D)."""
 
-    name: str = _name_of("sac")
+    name: str = _one_of(MISSING, "sac")
     learning_rate: float = _within(1e-3, 0, 1)
     batch_size: int = _at_least(64, 1)
     discount: float = _within(0.99, 0, 1)  # of the learner
     tau: float = _within(1e-2, 0, 1)  # share of the critic that moves into its target each update
     alpha: float = _within(1e-2, 0, 1e6)  # initial temperature
-    target_entropy: float = _checked(-5.0, math.isfinite, "a finite number", False)
+    target_entropy: float = _checked(-5.0, math.isfinite, "a finite number")
     # Decay of the average of the actor that is evaluated; 0: none.
-    averaging: float = _checked(0.0, lambda value: 0 <= value < 1, "0 or more, below 1", False)
+    averaging: float = _checked(0.0, lambda value: 0 <= value < 1, "0 or more, below 1")
 
 
 @dataclass
 class AugmentationConfig:
     """Rotated copies of the replayed transitions (appendix F)."""
 
-    name: str = _name_of("buffer", "none")
+    name: str = _one_of(MISSING, "buffer", "none")
     copies: int = _at_least(4, 0)
 
 
@@ -148,14 +177,14 @@ class Config:
     replay: ReplayConfig = _group(ReplayConfig)
     evaluation: EvaluationConfig = _group(EvaluationConfig, free=True)
     logging: LoggingConfig = _group(LoggingConfig, free=True)
-    mode: str = _one_of("strict", "paper")  # the mathematics, independent of sizes
+    mode: str = _one_of("strict", source=_MODES)  # the mathematics, independent of sizes
     group: str = "D4"  # C<n> or D<n>
     steps: int = _at_least(10_000, 1, free=True)  # environment steps, one update each
     checkpoint_every: int = _at_least(500, 1, free=True)  # steps
     seed: int = _at_least(0, 0)
     device: str = field(default="auto", metadata={"free": True})  # "auto", "cpu" or "cuda:<i>"
     threads: int = _at_least(0, 0, free=True)  # CPU threads of torch; 0: all cores
-    backend: str = _one_of("auto", "native", "dense", free=True)  # of equivariant encoders
+    backend: str = _one_of("auto", source=_BACKENDS, free=True)  # of equivariant encoders
 
     @property
     def torch_device(self) -> str:
@@ -220,7 +249,7 @@ class EvaluateJob:
     episodes: int = _at_least(100, 1)
     first: int = _at_least(0, 0)  # number of the first test scene
     device: str = "auto"
-    backend: str = _one_of("auto", "native", "dense")
+    backend: str = _one_of("auto", source=_BACKENDS)
     video: str = ""  # MP4 file to film the first episodes into
     video_episodes: int = _at_least(3, 1)
 
@@ -237,7 +266,7 @@ class WatchJob:
     output: str = ""  # a folder for film and sheet; outputs/watch/<task> when empty
     fps: int = _at_least(4, 1)  # steps a second
     # Pixels a side of each of the film's two pictures; video formats want an even number.
-    size: int = _checked(384, lambda value: value >= 2 and value % 2 == 0, "2 or more, even", False)
+    size: int = _checked(384, lambda value: value >= 2 and value % 2 == 0, "2 or more, even")
 
     def checked(self) -> WatchJob:
         """This job, if its task exists."""
@@ -278,7 +307,9 @@ def _check_values(config: Any, prefix: str = "") -> None:
             _check_values(value, f"{prefix}{entry.name}.")
         elif "valid" in entry.metadata and not entry.metadata["valid"](value):
             key = f"{prefix}{entry.name}".removesuffix(".name")
-            raise ConfigError(f"{key}={value}: expected {entry.metadata['expected']}")
+            expected = entry.metadata["expected"]
+            expected = expected() if callable(expected) else expected
+            raise ConfigError(f"{key}={value}: expected {expected}")
 
 
 def is_free(key: str) -> bool:
@@ -304,9 +335,41 @@ def to_config(values: Any, schema: type[Job] = Config) -> Job:  # type: ignore[a
         merged = OmegaConf.merge(OmegaConf.structured(schema), values)
         config = cast(Job, OmegaConf.to_object(merged))
     except OmegaConfBaseException as error:
-        raise ConfigError(str(error).splitlines()[0] + f" (key {error.full_key})") from None
+        raise ConfigError(explain(error, schema)) from None
     _check_values(config)
     return config.checked() if hasattr(config, "checked") else config
+
+
+def explain(error: Exception, schema: type) -> str:
+    """Says in one sentence why a configuration cannot be composed.
+
+    Args:
+        error: OmegaConf's, or Hydra's about one of OmegaConf's.
+        schema: The form of the keys.
+    """
+    reason = error if isinstance(error, OmegaConfBaseException) else error.__cause__
+    if isinstance(reason, OmegaConfBaseException):
+        key = reason.full_key or "a key"
+        if isinstance(reason, ConfigKeyError | ConfigAttributeError):
+            return f"{key}: there is no such key{_suggestion(key, schema)}"
+        if isinstance(reason, MissingMandatoryValue):
+            return f"{key}= is missing"
+        return f"{key}: {str(reason).splitlines()[0]}"
+    options = getattr(error, "options", None)  # of Hydra's groups
+    name = getattr(error, "missing_cfg_file", None)
+    if options and name:
+        group, _, choice = name.rpartition("/")
+        return f"{group}={choice}: expected one of {', '.join(options)}"
+    lines = [line.strip() for line in str(error).splitlines()]
+    return " ".join(line for line in lines if line and not line.startswith(("See ", "full_key")))
+
+
+def _suggestion(key: str, schema: type) -> str:
+    known = flatten(schema())
+    leaf = key.rpartition(".")[2]
+    similar = [name for name in known if name.rpartition(".")[2] == leaf]
+    similar = similar or get_close_matches(key, known, n=1) or get_close_matches(leaf, known, n=1)
+    return f"; did you mean {' or '.join(similar)}?" if similar else ""
 
 
 def save_config(config: Config, path: Path) -> None:

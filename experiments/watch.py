@@ -7,45 +7,34 @@ python experiments/watch.py policy=outputs/demo episodes=5
 
 from __future__ import annotations
 
-import os
 import sys
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import hydra
+from entry_point import entry_point
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
 
-from equirl.config import Config, ConfigError, WatchJob, register, to_config
+from equirl.config import Config, ConfigError, WatchJob
 
 if TYPE_CHECKING:
     from tensordict.nn import TensorDictModuleBase
 
     from equirl.envs import ManipulationEnv
 
-os.environ.setdefault("GOMP_SPINCOUNT", "1000")  # as in train.py
-register()
 
-
-@hydra.main(version_base="1.3", config_path="../conf", config_name="watch")
-def main(values: DictConfig) -> None:
+@entry_point("watch", WatchJob)
+def main(job: WatchJob) -> None:
     """Plays episodes, says how they ended and where the pictures are."""
-    from equirl.envs import PlacementError
-    from equirl.training import CheckpointError, load_policy, make_run_env
+    from equirl.training import load_policy, make_run_env
 
-    try:
-        job = to_config(values, WatchJob)
-        if job.policy in ("expert", "random"):
-            config, policy = Config(env=job.env), None
-        else:
-            _check_run(job.policy)
-            config, policy = load_policy(Path(job.policy), "auto", "auto")
-        with closing(make_run_env(config)) as env:
-            policy = policy or _scripted(job.policy, env, job.seed)
-            _watch(job, config, env, policy)
-    except (ConfigError, CheckpointError, PlacementError) as error:
-        sys.exit(f"error: {error}")
+    if job.policy in ("expert", "random"):
+        config, policy = Config(env=job.env), None
+    else:
+        _check_run(job.policy)
+        config, policy = load_policy(Path(job.policy), "auto", "auto")
+    with closing(make_run_env(config)) as env:
+        _watch(job, config, env, policy or _scripted(job.policy, env, job.seed))
 
 
 def _check_run(folder: str) -> None:

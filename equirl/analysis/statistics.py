@@ -7,13 +7,12 @@ import numpy as np
 __all__ = ["moving_return", "wilson_interval"]
 
 
-def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Wilson's score interval of a success rate (Wilson, 1927).
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """Wilson's score interval of a success rate at 95 % confidence (Wilson, 1927).
 
     Args:
         successes: Number of successes.
         trials: Number of trials, at least 1.
-        confidence: Coverage.
 
     Returns:
         Lower and upper bound.
@@ -25,7 +24,7 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tu
         raise ValueError(f"expected 0 <= successes <= trials >= 1, got {successes} of {trials}")
     from scipy.stats import binomtest
 
-    interval = binomtest(successes, trials).proportion_ci(confidence, method="wilson")
+    interval = binomtest(successes, trials).proportion_ci(0.95, method="wilson")
     return float(interval.low), float(interval.high)
 
 

@@ -7,13 +7,12 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torchrl.collectors import BaseCollector
 from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
 
-from equirl.collectors.scene_log import SceneLog
-from equirl.data import TRANSITION_KEYS
+from equirl.collectors.rollout import SceneRollout
 
 __all__ = ["DemonstrationCollector", "DemonstrationError"]
 
@@ -30,8 +29,8 @@ class DemonstrationCollector(BaseCollector):
 
     The demonstrations are a function of ``seed`` alone (given a policy that depends on the
     environment's seed only): the collector seeds each scene, on which an environment may play
-    several episodes (see `SceneLog`), and leaves it in the last attempt's final state. Iterating
-    again goes on with further episodes only after `set_seed` or `load_state_dict`.
+    several episodes (see `SceneRollout`), and leaves it in the last attempt's final state.
+    Iterating again goes on with further episodes only after `set_seed` or `load_state_dict`.
 
     Example:
         >>> env = make_env("block_picking", seed=0)
@@ -84,7 +83,7 @@ class DemonstrationCollector(BaseCollector):
         self.replay_buffer = replay_buffer
         self._episodes = episodes
         self._max_failures = max_failures
-        self._scenes = SceneLog(env, seeds or self._scene_seed)
+        self._rollout = SceneRollout(env, seeds or self._scene_seed, expert=True)
         self.closed = False
         self.set_seed(seed)
 
@@ -99,7 +98,7 @@ class DemonstrationCollector(BaseCollector):
             if self.closed:
                 raise RuntimeError("this collector was shut down; make a new one")
             episode = self._attempt()
-            if episode["next", "reward"][-1].item() <= 0:
+            if self._rollout.rewards[-1] <= 0:
                 failures += 1
                 if failures >= self._max_failures:
                     raise DemonstrationError(
@@ -119,23 +118,17 @@ class DemonstrationCollector(BaseCollector):
     @torch.no_grad()
     def _attempt(self) -> TensorDictBase:
         """Runs the next attempt and returns its transitions, shape [T]."""
-        transitions = []
-        current, done = self._scenes.begin(self.attempted), False
+        transitions, rollout = [], self._rollout
+        rollout.begin(self.attempted)
         self.attempted += 1
-        while not done:
-            step = self._scenes.step(self.policy(current.copy()))
-            transitions.append(self._transition(step))
-            current, done = step["next"].exclude("reward"), step["next", "done"].item()
+        while rollout.observation is not None:
+            action = self.policy(rollout.observation.copy())["action"]
+            transitions.append(rollout.step(action))
         return torch.stack(transitions)
 
     def _scene_seed(self, attempt: int) -> int:
         root = np.random.SeedSequence(self._seed, spawn_key=(attempt,))
         return int(root.generate_state(1)[0])
-
-    @staticmethod
-    def _transition(step: TensorDictBase) -> TensorDict:
-        labelled = step.copy().set("expert", torch.ones(1, dtype=torch.bool))
-        return labelled.select(*TRANSITION_KEYS)
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         """Starts over from ``seed``: the next iteration yields ``episodes`` episodes again.
@@ -148,7 +141,7 @@ class DemonstrationCollector(BaseCollector):
         self._seed = int(seed)
         self.attempted = 0
         self.episodes_collected = 0
-        self._scenes.forget()
+        self._rollout.forget()
         return seed if static_seed else seed + 1
 
     def state_dict(self) -> OrderedDict:
@@ -157,7 +150,7 @@ class DemonstrationCollector(BaseCollector):
             seed=self._seed,
             attempted=self.attempted,
             episodes_collected=self.episodes_collected,
-            scene=self._scenes.state_dict(),
+            scene=self._rollout.state_dict(),
         )
 
     def load_state_dict(self, state_dict: OrderedDict) -> None:
@@ -165,7 +158,7 @@ class DemonstrationCollector(BaseCollector):
         self._seed = state_dict["seed"]
         self.attempted = state_dict["attempted"]
         self.episodes_collected = state_dict["episodes_collected"]
-        self._scenes.load_state_dict(state_dict["scene"])
+        self._rollout.load_state_dict(state_dict["scene"])
 
     def shutdown(
         self, timeout: float | None = None, close_env: bool = True, raise_on_error: bool = True

@@ -3,38 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from equirl.collectors.scene_log import SceneLog
-from equirl.data import TRANSITION_KEYS
+from equirl.collectors.rollout import Episode, SceneRollout
 
-__all__ = ["Episode", "OnlineCollector"]
-
-
-@dataclass(frozen=True)
-class Episode:
-    """Summary of a finished episode."""
-
-    index: int
-    length: int
-    undiscounted: float  # return
-    discounted: float  # discounted return
-    success: bool
+__all__ = ["OnlineCollector"]
 
 
 class OnlineCollector:
     """Steps one environment with a stochastic policy and hands out single transitions.
 
-    Every scene starts from a seed of its own, so an open episode is the number of the scene's
-    first one and the actions taken since: that is all its state dict holds, and loading one
-    rebuilds the episode in the simulator by replaying them.
+    It is none of TorchRL's collectors, which step ahead of the learner and cannot say where they
+    are: here acting and learning alternate, and an open episode can be rebuilt exactly from the
+    seed of its scene and the actions since (see `SceneRollout`).
 
     Args:
         env: A single environment (batch size ``()``).
@@ -42,6 +29,9 @@ class OnlineCollector:
         seeds: Maps the number of an episode to the seed of its scene.
         discount: For the discounted return reported for each episode.
         device: Where the policy lives; the environment stays on the CPU.
+
+    Attributes:
+        episode: Number of the next or open episode, from 0.
     """
 
     def __init__(
@@ -53,75 +43,41 @@ class OnlineCollector:
         discount: float = 0.99,
         device: torch.device | str = "cpu",
     ):
-        self.env = env
         self.policy = policy
         self.discount = discount
         self.device = device
         self.episode = 0
-        self._scenes = SceneLog(env, seeds)
-        self._rewards: list[float] = []
-        self._current: TensorDictBase | None = None
+        self._rollout = SceneRollout(env, seeds, expert=False)
 
-    def act(self) -> TensorDictBase:
-        """Chooses the next action; begins an episode when none is open.
-
-        Returns:
-            The current step, with keys of the observation and ``action``.
-        """
-        if self._current is None:
-            self._current = self._scenes.begin(self.episode)
+    def act(self) -> torch.Tensor:
+        """Chooses the next action, shape (dim,); begins an episode when none is open."""
+        observation = self._rollout.observation
+        if observation is None:
+            observation = self._rollout.begin(self.episode)
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-            return self.policy(self._current.copy().to(self.device))
+            return self.policy(observation.copy().to(self.device))["action"].cpu()
 
-    def step(self, acted: TensorDictBase) -> tuple[TensorDict, Episode | None]:
-        """Takes the chosen action.
+    def step(self, action: torch.Tensor) -> tuple[TensorDict, Episode | None]:
+        """Takes an action.
 
         Args:
-            acted: What `act` returned.
+            action: What `act` returned.
 
         Returns:
-            The transition, of batch size (1,) and the keys of
-            `TRANSITION_KEYS`, and the episode's summary if it ended.
+            The transition, of batch size (1,) and the keys of `TRANSITION_KEYS`, and the
+            episode's summary if it ended.
         """
-        assert self._current is not None
-        taken = self._current.copy().set("action", acted["action"].detach().cpu())
-        stepped = self._scenes.step(taken)
-        self._note(stepped)
-        transition = stepped.copy().set("expert", torch.zeros(1, dtype=torch.bool))
-        transition = transition.select(*TRANSITION_KEYS).unsqueeze(0)
-        summary = self._close() if stepped["next", "done"].item() else None
-        return transition, summary
+        transition = self._rollout.step(action).unsqueeze(0)
+        if self._rollout.observation is not None:
+            return transition, None
+        self.episode += 1
+        return transition, Episode.of(self._rollout.rewards, self.discount)
 
     def state_dict(self) -> dict[str, Any]:
         """The number of the next or open episode, and what rebuilds its scene."""
-        return {
-            "episode": self.episode,
-            "open": len(self._rewards) > 0,
-            "scene": self._scenes.state_dict(),
-        }
+        return {"episode": self.episode, "scene": self._rollout.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Rebuilds the scene, and the open episode, from its seed and the actions taken."""
         self.episode = state["episode"]
-        self._rewards, self._current = [], None
-        steps = self._scenes.load_state_dict(state["scene"])
-        if state["open"]:
-            for stepped in steps:
-                self._note(stepped)
-
-    def _note(self, stepped: TensorDictBase) -> None:
-        self._rewards.append(stepped["next", "reward"].item())
-        self._current = step_mdp(stepped)
-
-    def _close(self) -> Episode:
-        rewards = self._rewards
-        summary = Episode(
-            index=self.episode,
-            length=len(rewards),
-            undiscounted=sum(rewards),
-            discounted=sum(r * self.discount**t for t, r in enumerate(rewards)),
-            success=rewards[-1] > 0,
-        )
-        self.episode += 1
-        self._rewards, self._current = [], None
-        return summary
+        self._rollout.load_state_dict(state["scene"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from tensordict import TensorDictBase
@@ -23,14 +23,14 @@ class QuantizeDepth(Transform):
 
     Args:
         maximum: The largest depth stored, in m; observations are clipped there.
-        keys: The depth images, each also looked up under ``"next"``.
+        in_keys: The depth images, each also looked up under ``"next"``.
     """
 
     _OFFSET = 2**15
     _LEVELS = 2**16 - 1
 
-    def __init__(self, maximum: float = 0.32, keys: tuple[str, ...] = ("depth",)):
-        nested = [*keys, *(("next", key) for key in keys)]
+    def __init__(self, maximum: float, in_keys: Sequence[str] = ("depth",)):
+        nested = [*in_keys, *(("next", key) for key in in_keys)]
         super().__init__(in_keys=nested, out_keys=nested, in_keys_inv=nested, out_keys_inv=nested)
         self.maximum = maximum
 
@@ -76,7 +76,7 @@ class RotationAugmentation(Transform):
 
     def __init__(
         self,
-        copies: int = 4,
+        copies: int,
         *,
         spec: SymmetrySpec | None = None,
         generator: torch.Generator | None = None,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 from torchrl.modules import ProbabilisticActor, TanhNormal
@@ -33,6 +35,9 @@ class EquivariantPolicy(nn.Module):
     Attributes:
         in_type: Two trivial fields, depth and flag.
         out_rep: The action's representation in this mode, which the mean obeys.
+        sharing: For each log standard deviation, how many components of the action it serves.
+        distribution: What mean and deviations are the parameters of, besides
+            ``distribution_options``.
     """
 
     def __init__(
@@ -43,16 +48,20 @@ class EquivariantPolicy(nn.Module):
         generator: torch.Generator | None = None,
     ):
         super().__init__()
-        self.out_rep = action_representation(mode)
         self.encoder = encoder
+        self.out_rep = action_representation(mode)
+        self.sharing: tuple[int, ...]
+        self.distribution: type[torch.distributions.Distribution]
+        self.distribution_options: dict[str, Any]
         self.in_type = encoder.in_type
         group = self.in_type.group
-        #: For each log standard deviation, how many components of the action it serves.
-        self.sharing = (
-            (1,) * self.out_rep.dim
-            if mode == "paper"
-            else tuple(irrep.dim for irrep in self.out_rep.irreps)
-        )
+        if mode == "paper":
+            self.sharing = (1,) * self.out_rep.dim
+            self.distribution, self.distribution_options = TanhNormal, {}
+        else:
+            self.sharing = tuple(irrep.dim for irrep in self.out_rep.irreps)
+            self.distribution = RadialTanhNormal
+            self.distribution_options = {"representation": self.out_rep}
         out_type = FieldType.of(group, self.out_rep) + FieldType.trivial(group, len(self.sharing))
         self.head = SteerableLinear(self.encoder.out_type, out_type, generator=generator)
         self.to(next(encoder.parameters()).device)
@@ -120,6 +129,4 @@ def make_actor(
         generator=generator,
     )
     policy = EquivariantPolicy(encoder, mode=mode, generator=generator)
-    if mode == "paper":
-        return as_actor(policy, TanhNormal)
-    return as_actor(policy, RadialTanhNormal, representation=policy.out_rep)
+    return as_actor(policy, policy.distribution, **policy.distribution_options)

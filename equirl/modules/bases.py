@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch.overrides import TorchFunctionMode
 
+from equirl.modules.fields import REGULAR, SIGN, TRIVIAL, VECTOR, VECTOR_X, VECTOR_Y
 from equirl.symmetry import SymmetryGroup
 
 with warnings.catch_warnings():
@@ -118,19 +119,19 @@ def _subgroup_id(group: SymmetryGroup) -> tuple[float | None, int]:
 
 def _representation(group: SymmetryGroup, field: str) -> Any:
     fiber, _, _ = escnn_group.o2_group(1).subgroup(_subgroup_id(group))
-    if field == "regular":
+    if field == REGULAR:
         return fiber.regular_representation
     irreps: dict[str, tuple[int, ...]]
     if group.reflections:
         irreps = {
-            "trivial": (0, 0),
-            "sign": (1, 0),
-            "vector": (1, 1),
-            "vector_x": (0, 1),
-            "vector_y": (1, 1),
+            TRIVIAL: (0, 0),
+            SIGN: (1, 0),
+            VECTOR: (1, 1),
+            VECTOR_X: (0, 1),
+            VECTOR_Y: (1, 1),
         }
     else:
-        irreps = {"trivial": (0,), "vector": (1,), "vector_x": (1,)}
+        irreps = {TRIVIAL: (0,), VECTOR: (1,), VECTOR_X: (1,)}
     return fiber.irrep(*irreps[field])
 
 

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F
 from tensordict.nn import TensorDictSequential
 from torch import Tensor, nn
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
 from equirl.modules.actor import LOG_STD_RANGE
-from equirl.modules.layout import check_sizes, pyramid, resolve_device, stack_observation
+from equirl.modules.layout import check_sizes, convolve, resolve_device, skeleton, stack_observation
 from equirl.modules.wiring import as_actor, as_critic
+from equirl.symmetry import ACTION
 
 __all__ = ["CNNEncoder", "make_cnn_actor", "make_cnn_critic"]
-
-_ACTION_DIM = 5
 
 
 class CNNEncoder(nn.Module):
@@ -36,22 +34,17 @@ class CNNEncoder(nn.Module):
         super().__init__()
         check_sizes(hidden, image_size)
         self.image_size, self.out_features = image_size, 2 * hidden
-        rows = [(int(2 * width * hidden), 1, True) for width in pyramid(image_size)]
-        rows += [(4 * hidden, 1, False), (4 * hidden, 0, True), (2 * hidden, 0, False)]
-        self.layers, self.pools = nn.ModuleList(), tuple(pool for _, _, pool in rows)
+        rows = skeleton(image_size, 2 * hidden, tail=(2, 2, 1))
+        self.layers, self.pools = nn.ModuleList(), tuple(row.pool for row in rows)
         channels = 2
-        for width, padding, _ in rows:
-            self.layers.append(nn.Conv2d(channels, width, 3, padding=padding))
-            channels = width
+        for row in rows:
+            self.layers.append(nn.Conv2d(channels, row.width, 3, padding=row.padding))
+            channels = row.width
 
     def forward(self, depth: Tensor, holding: Tensor) -> Tensor:
         """Encodes (*batch, 1, S, S) and (*batch, 1) to (*batch, 2 * hidden)."""
         x = stack_observation(depth, holding, self.image_size)
-        for convolution, pool in zip(self.layers, self.pools, strict=True):
-            x = convolution(x)
-            if pool:  # before the ReLU, with which it commutes: a quarter of the work
-                x = F.max_pool2d(x, 2)
-            x = F.relu(x, inplace=True)
+        x = convolve(self.layers, self.pools, x)
         return x.reshape(*depth.shape[:-3], self.out_features)
 
 
@@ -59,8 +52,8 @@ class _CNNPolicy(nn.Module):
     def __init__(self, encoder: CNNEncoder):
         super().__init__()
         self.encoder = encoder
-        self.loc = nn.Linear(encoder.out_features, _ACTION_DIM)
-        self.log_std = nn.Linear(encoder.out_features, _ACTION_DIM)
+        self.loc = nn.Linear(encoder.out_features, ACTION.dim)
+        self.log_std = nn.Linear(encoder.out_features, ACTION.dim)
 
     def forward(self, depth: Tensor, holding: Tensor) -> tuple[Tensor, Tensor]:
         features = self.encoder(depth, holding)
@@ -72,7 +65,7 @@ class _QHeads(nn.Module):
         super().__init__()
         self.heads = nn.ModuleList(
             nn.Sequential(
-                nn.Linear(features + _ACTION_DIM, features), nn.ReLU(), nn.Linear(features, 1)
+                nn.Linear(features + ACTION.dim, features), nn.ReLU(), nn.Linear(features, 1)
             )
             for _ in range(heads)
         )

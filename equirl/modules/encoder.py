@@ -5,12 +5,11 @@ from __future__ import annotations
 from typing import cast
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from equirl.modules.backend import resolve_backend
 from equirl.modules.fields import FieldType
-from equirl.modules.layout import check_sizes, pyramid, resolve_device, stack_observation
+from equirl.modules.layout import check_sizes, convolve, resolve_device, skeleton, stack_observation
 from equirl.modules.native import layer as native
 from equirl.modules.steerable import SteerableConv
 from equirl.symmetry import SymmetryGroup
@@ -62,14 +61,13 @@ class EquivariantEncoder(nn.Module):
         self.backend = resolve_backend(backend, group, resolve_device(device))
         self.in_type = FieldType.trivial(group, 2)
         self.out_type = FieldType.regular(group, hidden)
-        # Fields out, padding and whether to pool, layer by layer.
-        rows = [(int(width * hidden), 1, True) for width in pyramid(image_size)]
-        rows += [(2 * hidden, 1, False), (hidden, 0, True), (hidden, 0, False)]
-        self.layers, self.pools = nn.ModuleList(), tuple(pool for _, _, pool in rows)
+        rows = skeleton(image_size, hidden)
+        self.layers, self.pools = nn.ModuleList(), tuple(row.pool for row in rows)
         fields = self.in_type
-        for width, padding, _ in rows:
-            out = FieldType.regular(group, width)
-            self.layers.append(SteerableConv(fields, out, padding=padding, generator=generator))
+        for row in rows:
+            out = FieldType.regular(group, row.width)
+            layer = SteerableConv(fields, out, padding=row.padding, generator=generator)
+            self.layers.append(layer)
             fields = out
         self.to(resolve_device(device))
 
@@ -88,9 +86,5 @@ class EquivariantEncoder(nn.Module):
         if self.backend == "native" and native.runs(layers, x):
             x = native.encode(layers, self.pools, x)
         else:
-            for convolution, pool in zip(layers, self.pools, strict=True):
-                x = convolution(x)
-                if pool:  # before the ReLU, with which it commutes: a quarter of the work
-                    x = F.max_pool2d(x, 2)
-                x = F.relu(x, inplace=True)
+            x = convolve(layers, self.pools, x)
         return x.reshape(*depth.shape[:-3], self.out_type.size)

@@ -11,11 +11,21 @@ from torch import Tensor
 
 from equirl.symmetry import Element, Irrep, Representation, SymmetryGroup
 
-__all__ = ["FieldType", "element_key"]
+__all__ = [
+    "REGULAR",
+    "SIGN",
+    "TRIVIAL",
+    "VECTOR",
+    "VECTOR_X",
+    "VECTOR_Y",
+    "FieldType",
+    "element_key",
+]
 
-_REGULAR = "regular"
-_TRIVIAL, _SIGN, _VECTOR = Irrep.TRIVIAL.value, Irrep.SIGN.value, Irrep.VECTOR.value
-_VECTOR_X, _VECTOR_Y = "vector_x", "vector_y"
+# Kinds of fields: regular ones, the irreps of O(2), and what a half turn leaves of a vector.
+REGULAR = "regular"
+TRIVIAL, SIGN, VECTOR = Irrep.TRIVIAL.value, Irrep.SIGN.value, Irrep.VECTOR.value
+VECTOR_X, VECTOR_Y = "vector_x", "vector_y"
 
 
 @dataclass(frozen=True)
@@ -39,12 +49,12 @@ class FieldType:
     @classmethod
     def regular(cls, group: SymmetryGroup, count: int) -> FieldType:
         """``count`` regular fields."""
-        return cls(group, (_REGULAR,) * count)
+        return cls(group, (REGULAR,) * count)
 
     @classmethod
     def trivial(cls, group: SymmetryGroup, count: int) -> FieldType:
         """``count`` invariant channels."""
-        return cls(group, (_TRIVIAL,) * count)
+        return cls(group, (TRIVIAL,) * count)
 
     @classmethod
     def of(cls, group: SymmetryGroup, representation: Representation) -> FieldType:
@@ -52,9 +62,9 @@ class FieldType:
         fields: list[str] = []
         for irrep in representation.irreps:
             if irrep is Irrep.VECTOR and group.rotations == 2:
-                fields += [_VECTOR_X, _VECTOR_Y if group.reflections else _VECTOR_X]
+                fields += [VECTOR_X, VECTOR_Y if group.reflections else VECTOR_X]
             elif irrep is Irrep.SIGN and not group.reflections:
-                fields.append(_TRIVIAL)
+                fields.append(TRIVIAL)
             else:
                 fields.append(irrep.value)
         return cls(group, tuple(fields))
@@ -71,9 +81,9 @@ class FieldType:
 
     def dim(self, field: str) -> int:
         """Number of channels of one field."""
-        if field == _REGULAR:
+        if field == REGULAR:
             return self.group.order
-        return 2 if field == _VECTOR else 1
+        return 2 if field == VECTOR else 1
 
     @cached_property
     def size(self) -> int:
@@ -92,7 +102,7 @@ class FieldType:
     @property
     def is_regular(self) -> bool:
         """Whether every field is regular."""
-        return all(field == _REGULAR for field in self.fields)
+        return all(field == REGULAR for field in self.fields)
 
     def bias_layout(self) -> tuple[list[int], list[float]]:
         """Which bias each channel receives, and its weight.
@@ -105,7 +115,7 @@ class FieldType:
         """
         index, factor, count = [], [], 0
         for field in self.fields:
-            has_bias = field in (_REGULAR, _TRIVIAL)
+            has_bias = field in (REGULAR, TRIVIAL)
             index += [count if has_bias else 0] * self.dim(field)
             factor += [self.dim(field) ** -0.5 if has_bias else 0.0] * self.dim(field)
             count += has_bias
@@ -114,7 +124,7 @@ class FieldType:
     @property
     def bias_count(self) -> int:
         """Number of biases: one per field that contains the trivial representation."""
-        return sum(field in (_REGULAR, _TRIVIAL) for field in self.fields)
+        return sum(field in (REGULAR, TRIVIAL) for field in self.fields)
 
     def transform(self, x: Tensor, element: Element) -> Tensor:
         """Applies a group element to the channels of ``x`` of shape (..., size).
@@ -135,11 +145,11 @@ class FieldType:
     def _transform_field(
         self, x: Tensor, field: str, element: Element, source: list[int]
     ) -> Tensor:
-        if field == _REGULAR:
+        if field == REGULAR:
             return x[..., source]
-        if field == _VECTOR_X:
+        if field == VECTOR_X:
             return x * round(element.cos_sin[0])
-        if field == _VECTOR_Y:
+        if field == VECTOR_Y:
             return x * round(element.cos_sin[0]) * (-1 if element.reflected else 1)
         return Representation(field).transform(x, element)
 

@@ -1,13 +1,25 @@
-"""What the equivariant and the plain encoder share: sizes, and how an observation enters."""
+"""What all encoders share: sizes, layers, and how an observation enters."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
+from typing import NamedTuple
 
 import torch
-from torch import Tensor
+import torch.nn.functional as F
+from torch import Tensor, nn
 
-__all__ = ["IMAGE_SIZES", "check_sizes", "pyramid", "resolve_device", "stack_observation"]
+__all__ = [
+    "IMAGE_SIZES",
+    "Layer",
+    "check_sizes",
+    "convolve",
+    "pyramid",
+    "resolve_device",
+    "skeleton",
+    "stack_observation",
+]
 
 #: The image sizes the encoders are defined for.
 IMAGE_SIZES = (16, 32, 64, 128, 256)
@@ -41,6 +53,39 @@ def pyramid(image_size: int) -> list[float]:
     """
     halvings = int(math.log2(image_size // 8))
     return [2.0**-step for step in reversed(range(halvings))]
+
+
+class Layer(NamedTuple):
+    """A 3 x 3 convolution with a ReLU, and what follows it."""
+
+    width: int
+    padding: int
+    pool: bool  # whether a 2 x 2 maximum follows
+
+
+def skeleton(
+    image_size: int, hidden: int, tail: tuple[float, float, float] = (2, 1, 1)
+) -> list[Layer]:
+    """The layers that shrink an image to one pixel (appendix A, figure 7).
+
+    Args:
+        image_size: Side of the image, one of `IMAGE_SIZES`.
+        hidden: Width of the layer that leaves 8 x 8 pixels.
+        tail: Widths of the last three layers, in units of ``hidden``.
+    """
+    rows = [Layer(int(width * hidden), 1, True) for width in pyramid(image_size)]
+    last = [(1, False), (0, True), (0, False)]
+    return rows + [Layer(int(n * hidden), *rest) for n, rest in zip(tail, last, strict=True)]
+
+
+def convolve(layers: Iterable[nn.Module], pools: Iterable[bool], x: Tensor) -> Tensor:
+    """Runs the convolutions of a `skeleton`, (N, channels, S, S) to (N, channels, 1, 1)."""
+    for convolution, pool in zip(layers, pools, strict=True):
+        x = convolution(x)
+        if pool:  # before the ReLU, with which it commutes: a quarter of the work
+            x = F.max_pool2d(x, 2)
+        x = F.relu(x, inplace=True)
+    return x
 
 
 def resolve_device(device: torch.device | str | None) -> torch.device:

@@ -12,12 +12,23 @@ from torch import Tensor
 from equirl.symmetry.groups import Element
 from equirl.symmetry.representations import Representation, ScalarField
 
-__all__ = ["ACTION", "ACTION_PAPER", "SymmetrySpec", "action_representation", "manipulation_spec"]
+__all__ = [
+    "ACTION",
+    "ACTION_PAPER",
+    "MODES",
+    "SymmetrySpec",
+    "action_representation",
+    "manipulation_spec",
+]
 
 #: The action (gripper, x, y, z, theta): a reflection reverses the sense of theta.
 ACTION = Representation("trivial", "vector", "trivial", "sign")
 #: The action as the paper's networks declare it (appendix A): theta an invariant.
 ACTION_PAPER = Representation("trivial", "vector", "trivial", "trivial")
+
+
+#: How the networks of each mode take an action to transform.
+MODES = {"strict": ACTION, "paper": ACTION_PAPER}
 
 
 def action_representation(mode: str) -> Representation:
@@ -29,10 +40,9 @@ def action_representation(mode: str) -> Representation:
     Raises:
         ValueError: Any other mode.
     """
-    try:
-        return {"strict": ACTION, "paper": ACTION_PAPER}[mode]
-    except KeyError:
-        raise ValueError(f"unknown mode {mode!r}: expected 'strict' or 'paper'") from None
+    if mode not in MODES:
+        raise ValueError(f"mode={mode!r}: expected one of {', '.join(MODES)}")
+    return MODES[mode]
 
 
 class SymmetrySpec:

@@ -1,16 +1,20 @@
 """Training, checkpoints, evaluation and reports of runs."""
 
 from equirl.training.checkpoint import CheckpointError, load_checkpoint
+from equirl.training.environment import make_run_env, make_run_expert
 from equirl.training.evaluation import Evaluation, evaluate
-from equirl.training.folder import CHECKPOINT, FolderError, load_run_config
-from equirl.training.learner import Learner, load_policy, make_networks
-from equirl.training.loop import TrainingRun, make_run_env
+from equirl.training.folder import CHECKPOINT, CONFIG, REPORT, FolderError, load_run_config
+from equirl.training.learner import Learner, load_policy
+from equirl.training.loop import TrainingRun
+from equirl.training.networks import make_networks
 from equirl.training.seeding import Purpose, scene_seed
 from equirl.training.train import train
 from equirl.training.video import film_policy
 
 __all__ = [
     "CHECKPOINT",
+    "CONFIG",
+    "REPORT",
     "CheckpointError",
     "Evaluation",
     "FolderError",
@@ -24,6 +28,7 @@ __all__ = [
     "load_run_config",
     "make_networks",
     "make_run_env",
+    "make_run_expert",
     "scene_seed",
     "train",
 ]

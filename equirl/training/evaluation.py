@@ -6,31 +6,29 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from equirl.analysis.statistics import wilson_interval
+from equirl.collectors import Episode
 from equirl.modules import shared_filters
 
-__all__ = ["EpisodeResult", "Evaluation", "evaluate", "play"]
-
-
-@dataclass(frozen=True)
-class EpisodeResult:
-    """One greedy episode."""
-
-    seed: int
-    success: bool
-    length: int
-    discounted: float
+__all__ = ["Evaluation", "evaluate", "play"]
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The outcome of a policy over a set of scenes."""
+    """The outcome of a policy over a set of scenes.
 
-    episodes: tuple[EpisodeResult, ...]
+    Attributes:
+        seeds: The scenes.
+        episodes: The greedy episode on each.
+    """
+
+    seeds: tuple[int, ...]
+    episodes: tuple[Episode, ...]
 
     @property
     def successes(self) -> int:
@@ -48,9 +46,9 @@ class Evaluation:
         return wilson_interval(self.successes, len(self.episodes))
 
     @property
-    def discounted(self) -> float:
+    def discounted_return(self) -> float:
         """Mean discounted return."""
-        return sum(episode.discounted for episode in self.episodes) / len(self.episodes)
+        return sum(episode.discounted_return for episode in self.episodes) / len(self.episodes)
 
     def __str__(self) -> str:
         low, high = self.interval
@@ -63,43 +61,42 @@ class Evaluation:
 def play(
     env: EnvBase,
     policy: TensorDictModuleBase,
-    seed: int,
     *,
+    seed: int | None = None,
     discount: float = 0.99,
     device: torch.device | str = "cpu",
-    on_step: Callable[[torch.Tensor], None] | None = None,
-) -> EpisodeResult:
+    on_moment: Callable[[TensorDictBase, torch.Tensor | None, float], None] | None = None,
+) -> Episode:
     """Plays one greedy episode.
 
     Args:
         env: A single environment.
         policy: Acts deterministically; no random number is drawn.
-        seed: The scene.
+        seed: The scene; when None it is what the next reset of ``env`` gives.
         discount: For the discounted return.
         device: Where the policy lives.
-        on_step: Called with each observation's depth image, the first included.
+        on_moment: Called at each state, before the environment leaves it, with the observation,
+            the action (dim,) that follows, None at the end, and the reward that the action
+            before has earned.
     """
-    env.set_seed(seed, static_seed=True)
-    current = env.reset()
+    if seed is not None:
+        env.set_seed(seed, static_seed=True)
+    current, done = env.reset(), False
     rewards: list[float] = []
-    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+    with (
+        torch.no_grad(),
+        shared_filters(),
+        set_exploration_type(ExplorationType.DETERMINISTIC),
+    ):
         while True:
-            if on_step:
-                on_step(current["depth"])
-            action = policy(current.copy().to(device))["action"].cpu()
+            action = None if done else policy(current.copy().to(device))["action"].cpu()
+            if on_moment:
+                on_moment(current, action, rewards[-1] if rewards else 0.0)
+            if action is None:
+                return Episode.of(rewards, discount)
             stepped = env.step(current.set("action", action))
             rewards.append(stepped["next", "reward"].item())
-            current = step_mdp(stepped)
-            if stepped["next", "done"].item():
-                break
-    if on_step:
-        on_step(current["depth"])
-    return EpisodeResult(
-        seed=seed,
-        success=rewards[-1] > 0,
-        length=len(rewards),
-        discounted=sum(reward * discount**t for t, reward in enumerate(rewards)),
-    )
+            current, done = step_mdp(stepped), stepped["next", "done"].item()
 
 
 def evaluate(
@@ -109,7 +106,7 @@ def evaluate(
     *,
     discount: float = 0.99,
     device: torch.device | str = "cpu",
-    on_episode: Callable[[EpisodeResult], None] | None = None,
+    on_episode: Callable[[Episode], None] | None = None,
 ) -> Evaluation:
     """Plays one greedy episode for each seed.
 
@@ -122,9 +119,8 @@ def evaluate(
         on_episode: Called after each episode, for progress.
     """
     results = []
-    with shared_filters():
-        for seed in seeds:
-            results.append(play(env, policy, seed, discount=discount, device=device))
-            if on_episode:
-                on_episode(results[-1])
-    return Evaluation(tuple(results))
+    for seed in seeds:
+        results.append(play(env, policy, seed=seed, discount=discount, device=device))
+        if on_episode:
+            on_episode(results[-1])
+    return Evaluation(tuple(seeds), tuple(results))

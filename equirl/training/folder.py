@@ -17,6 +17,11 @@ from equirl.training.checkpoint import check_same_config
 __all__ = [
     "CHECKPOINT",
     "CONFIG",
+    "CURVES",
+    "FILES",
+    "REPORT",
+    "TEST",
+    "VIDEO",
     "FolderError",
     "claim_folder",
     "load_run_config",
@@ -24,9 +29,21 @@ __all__ = [
     "stop_on_interrupt",
 ]
 
-CONFIG = "config.yaml"
-LOCK = ".lock"
-CHECKPOINT = "checkpoint.pt"
+CONFIG, CHECKPOINT, LOCK = "config.yaml", "checkpoint.pt", ".lock"
+TEST, REPORT, CURVES, VIDEO = "test.csv", "report.md", "curves.png", "policy.mp4"
+
+#: What a run leaves in its folder.
+FILES = {
+    CONFIG: "the resolved configuration",
+    "metrics.csv": "a row a training episode",
+    "validation.csv": "success of the greedy policy on the validation scenes, while training",
+    TEST: "a row a test scene, after training",
+    "timing.csv": "minutes so far, and milliseconds a call of each part of a step",
+    CHECKPOINT: "networks, optimiser, replay buffer: all a resume needs",
+    CURVES: "learning curves",
+    VIDEO: "the learned policy at work",
+    REPORT: "this page",
+}
 
 
 class FolderError(RuntimeError):

@@ -12,45 +12,13 @@ from torch.optim.swa_utils import AveragedModel
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import SoftUpdate
 
-from equirl.config import Config, ConfigError, flatten
-from equirl.modules import (
-    NativeUnavailable,
-    make_actor,
-    make_cnn_actor,
-    make_cnn_critic,
-    make_critic,
-    resolve_backend,
-)
+from equirl.config import Config, flatten
 from equirl.objectives import SACLoss
-from equirl.symmetry import SymmetryGroup
 from equirl.training.checkpoint import check_same_config, load_checkpoint
 from equirl.training.folder import CHECKPOINT, load_run_config
-from equirl.training.seeding import Purpose, torch_generator
+from equirl.training.networks import make_networks
 
-__all__ = ["Learner", "load_policy", "make_networks"]
-
-
-def make_networks(config: Config) -> tuple[ProbabilisticActor, torch.nn.Module]:
-    """Builds actor and critic of the configured method, initialised from the run's seed.
-
-    Raises:
-        ConfigError: A device or a backend that this machine does not have.
-    """
-    size: dict[str, Any] = {
-        "hidden": config.method.hidden,
-        "image_size": config.env.image_size,
-        "generator": torch_generator(config.seed, Purpose.NETWORKS),
-        "device": config.torch_device,
-    }
-    if config.method.name == "cnn":
-        return make_cnn_actor(**size), make_cnn_critic(**size)
-    try:
-        resolve_backend(config.backend, SymmetryGroup(config.group), config.torch_device)
-    except (ValueError, NativeUnavailable) as error:
-        raise ConfigError(str(error)) from None
-    size |= {"mode": config.mode, "backend": config.backend}
-    actor = make_actor(config.group, **size)
-    return actor, make_critic(config.group, head_width=config.method.head_width or None, **size)
+__all__ = ["Learner", "load_policy"]
 
 
 class Learner:

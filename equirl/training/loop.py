@@ -13,8 +13,6 @@ import torch
 from equirl.collectors import DemonstrationCollector, Episode, OnlineCollector
 from equirl.config import Config, flatten
 from equirl.data import load_replay_state, make_replay_buffer, replay_state
-from equirl.envs import ManipulationEnv, make_env, make_expert
-from equirl.envs.tasks import find_task
 from equirl.modules import shared_filters
 from equirl.training.checkpoint import (
     CheckpointError,
@@ -22,6 +20,7 @@ from equirl.training.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
+from equirl.training.environment import make_run_env, make_run_expert
 from equirl.training.evaluation import Evaluation, evaluate
 from equirl.training.folder import CHECKPOINT
 from equirl.training.learner import Learner
@@ -30,27 +29,10 @@ from equirl.training.progress import Progress
 from equirl.training.seeding import Purpose, scene_seed, seed_everything, torch_generator
 from equirl.training.timing import Stopwatch
 
-__all__ = ["TrainingRun", "make_run_env"]
+__all__ = ["TrainingRun"]
 
 #: What the run's time is divided into.
 PARTS = ("demonstrations", "act", "environment", "replay", "update", "evaluation", "checkpoint")
-
-
-def make_run_env(config: Config, **options: Any) -> ManipulationEnv:
-    """The environment of a run.
-
-    ``paper`` mode stores time-outs as terminal and judges as the paper's implementation does.
-    """
-    paper = config.mode == "paper"
-    defaults = find_task(config.env.task).paper_options if paper else {}
-    return make_env(
-        config.env.task,
-        image_size=config.env.image_size,
-        robot=config.env.robot,
-        max_steps=config.env.max_steps,
-        time_limit="terminate" if paper else "truncate",
-        **{**defaults, **config.env.options, **options},
-    )
 
 
 class TrainingRun:
@@ -125,10 +107,9 @@ class TrainingRun:
     def _collect_demonstrations(self) -> None:
         if self.config.demos.episodes == 0:
             return
-        clip = {"horizontal_clip": "box" if self.config.mode == "paper" else "norm"}
         demonstrations = DemonstrationCollector(
             self.env,
-            make_expert(self.env, **clip | self.config.demos.options),
+            make_run_expert(self.config, self.env),
             episodes=self.config.demos.episodes,
             seeds=partial(scene_seed, self.config.seed, Purpose.DEMONSTRATIONS),
             replay_buffer=self.buffer,
@@ -160,9 +141,9 @@ class TrainingRun:
     def _step(self) -> Episode | None:
         """One environment step and one update; the episode's summary if it ended."""
         with self.clock.measure("act"):
-            acted = self.collector.act()
+            action = self.collector.act()
         with self.clock.measure("environment"):
-            transition, episode = self.collector.step(acted)
+            transition, episode = self.collector.step(action)
         with self.clock.measure("replay"):
             self.buffer.extend(transition)
         if len(self.buffer) * (self.config.copies + 1) >= self.config.replay.start:
@@ -176,11 +157,11 @@ class TrainingRun:
         self.progress.note(episode)
         row: dict[str, float | int] = {
             "step": self.step,
-            "episode": episode.index,
+            "episode": self.collector.episode - 1,
             "length": episode.length,
             "success": int(episode.success),
-            "return": episode.undiscounted,
-            "discounted_return": episode.discounted,
+            "return": episode.undiscounted_return,
+            "discounted_return": episode.discounted_return,
         }
         self.log.write("metrics", row | self.averages.read())
 
@@ -194,7 +175,7 @@ class TrainingRun:
             "success_rate": outcome.success_rate,
             "low": low,
             "high": high,
-            "discounted_return": outcome.discounted,
+            "discounted_return": outcome.discounted_return,
         }
         self.log.write("validation", row)
         self.log.write("timing", {"step": self.step, **self.clock.summary()})

@@ -44,7 +44,7 @@ class Progress:
             count = len(self._recent)
             bar.set_postfix(
                 {
-                    "return": f"{sum(e.discounted for e in self._recent) / count:.2f}",
+                    "return": f"{sum(e.discounted_return for e in self._recent) / count:.2f}",
                     "success": f"{sum(e.success for e in self._recent) / count:.0%}",
                     "greedy": self.greedy,
                     "update": f"{update_seconds * 1e3:.0f}ms",

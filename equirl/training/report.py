@@ -8,6 +8,8 @@ from equirl.analysis import read_table
 from equirl.analysis.curves import plot_run
 from equirl.config import Config
 from equirl.training.evaluation import Evaluation
+from equirl.training.folder import CURVES, FILES, REPORT
+from equirl.training.networks import describe_method
 
 __all__ = ["write_report"]
 
@@ -26,12 +28,12 @@ def write_report(
     Returns:
         The page's path.
     """
-    plot_run(folder, folder / "curves.png")
+    plot_run(folder, folder / CURVES)
     timing = read_table(folder / "timing.csv")
     low, high = evaluation.interval
     solved = [episode.length for episode in evaluation.episodes if episode.success]
     lines = [
-        f"# {config.env.task.replace('_', ' ').capitalize()}, {_networks(config)}",
+        f"# {config.env.task.replace('_', ' ').capitalize()}, {describe_method(config)}",
         "",
         f"**{evaluation.success_rate:.0%} success** on {len(evaluation.episodes)} held-out "
         f"scenes (95 % confidence interval {low:.0%} to {high:.0%}), greedy policy, after "
@@ -40,7 +42,7 @@ def write_report(
         "| | |",
         "| --- | --- |",
         f"| mean discounted return (discount {config.evaluation.discount}) "
-        f"| {evaluation.discounted:.3f} |",
+        f"| {evaluation.discounted_return:.3f} |",
     ]
     if solved:
         lines.append(f"| mean length of a successful episode | {sum(solved) / len(solved):.1f} |")
@@ -50,7 +52,7 @@ def write_report(
     lines += [
         f"| seed | {config.seed} |",
         "",
-        "![Learning curves](curves.png)",
+        f"![Learning curves]({CURVES})",
         "",
         "Left above: success of the greedy policy on validation scenes with its confidence "
         "interval. Right above: what the exploring policy earned while training.",
@@ -66,19 +68,9 @@ def write_report(
     lines += [
         "| file | what |",
         "| --- | --- |",
-        "| `config.yaml` | the resolved configuration |",
-        "| `checkpoint.pt` | networks, optimiser, replay buffer: all a resume needs |",
-        "| `metrics.csv` | a row a training episode |",
-        "| `validation.csv`, `test.csv` | greedy evaluations |",
-        "| `timing.csv` | milliseconds of each part of a step |",
+        *(f"| `{name}` | {what} |" for name, what in FILES.items()),
         "",
     ]
-    page = folder / "report.md"
+    page = folder / REPORT
     page.write_text("\n".join(lines))
     return page
-
-
-def _networks(config: Config) -> str:
-    if config.method.name == "equivariant":
-        return f"{config.group}-equivariant SAC ({config.mode} mode)"
-    return f"{config.method.name.upper()} SAC"

@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import csv
 from contextlib import closing
-from dataclasses import asdict
 from pathlib import Path
 
 from equirl.config import Config
+from equirl.training.environment import make_run_env
 from equirl.training.evaluation import Evaluation
-from equirl.training.folder import claim_folder, prepare_folder, stop_on_interrupt
-from equirl.training.loop import TrainingRun, make_run_env
+from equirl.training.folder import (
+    CURVES,
+    REPORT,
+    TEST,
+    VIDEO,
+    claim_folder,
+    prepare_folder,
+    stop_on_interrupt,
+)
+from equirl.training.loop import TrainingRun
 from equirl.training.report import write_report
 from equirl.training.seeding import Purpose, scene_seed
 from equirl.training.video import film_policy
 
 __all__ = ["train", "write_episodes"]
-
-#: What describes the policy at the end of a run, in the order it is written.
-RESULTS = ("test.csv", "report.md", "curves.png", "policy.mp4")
 
 
 def train(config: Config, folder: Path) -> Evaluation | None:
@@ -44,15 +49,15 @@ def train(config: Config, folder: Path) -> Evaluation | None:
         prepare_folder(folder, config)
         with stop_on_interrupt() as should_stop:
             run = TrainingRun(config, folder, should_stop)
-            for name in RESULTS:  # those of an earlier end describe another policy
+            for name in (TEST, REPORT, CURVES, VIDEO):  # of an earlier end: of another policy
                 (folder / name).unlink(missing_ok=True)
             evaluation = run.run()
         if evaluation is None:
             return None
-        write_episodes(evaluation, folder / "test.csv")
+        write_episodes(evaluation, folder / TEST)
         write_report(folder, config, evaluation)
-        if config.evaluation.video_episodes and _film(run, folder / "policy.mp4"):
-            write_report(folder, config, evaluation, video=folder / "policy.mp4")
+        if config.evaluation.video_episodes and _film(run, folder / VIDEO):
+            write_report(folder, config, evaluation, video=folder / VIDEO)
     return evaluation
 
 
@@ -76,7 +81,8 @@ def _film(run: TrainingRun, path: Path) -> bool:
 def write_episodes(evaluation: Evaluation, path: Path) -> None:
     """Writes one row an episode of an evaluation."""
     with open(path, "w", newline="") as file:
-        rows = [{**asdict(e), "success": int(e.success)} for e in evaluation.episodes]
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(("seed", "success", "length", "discounted_return"))
+        for seed, episode in zip(evaluation.seeds, evaluation.episodes, strict=True):
+            row = (seed, int(episode.success), episode.length, episode.discounted_return)
+            writer.writerow(row)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +12,9 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from equirl.envs import ManipulationEnv
-from equirl.modules import shared_filters
+from equirl.training.evaluation import play
 
 __all__ = ["Frame", "film_policy", "open_film", "record"]
 
@@ -65,29 +64,22 @@ def record(
     Returns:
         A frame for the start and one for each step.
     """
-    if seed is not None:
-        env.set_seed(seed, static_seed=True)
-    current = env.reset()
-    frames = [_frame(env, current, side)]
-    done = False
-    with torch.no_grad(), shared_filters(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        while not done:
-            action = policy(current.copy().to(device))["action"].cpu()
-            frames[-1] = replace(frames[-1], action=action.numpy())
-            stepped = env.step(current.set("action", action))
-            current, done = step_mdp(stepped), stepped["next", "done"].item()
-            frames.append(_frame(env, current, side, stepped["next", "reward"].item()))
+    frames: list[Frame] = []
+
+    def shoot(seen: TensorDictBase, action: torch.Tensor | None, reward: float) -> None:
+        frames.append(
+            Frame(
+                picture=env.render(side, side),
+                depth=seen["depth"][0].numpy(),
+                deepest=env.workspace.z_max,
+                holding=bool(seen["holding"].item()),
+                reward=reward,
+                action=None if action is None else action.numpy(),
+            )
+        )
+
+    play(env, policy, seed=seed, device=device, on_moment=shoot)
     return frames
-
-
-def _frame(env: ManipulationEnv, seen: TensorDictBase, side: int, reward: float = 0.0) -> Frame:
-    return Frame(
-        picture=env.render(side, side),
-        depth=seen["depth"][0].numpy(),
-        deepest=env.workspace.z_max,
-        holding=bool(seen["holding"].item()),
-        reward=reward,
-    )
 
 
 def film_policy(

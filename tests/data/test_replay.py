@@ -15,32 +15,7 @@ from equirl.data import (
     replay_state,
 )
 from equirl.symmetry import Representation, SymmetrySpec, manipulation_spec
-
-
-def transitions(count: int, size: int = 16, seed: int = 0) -> TensorDict:
-    generator = torch.Generator().manual_seed(seed)
-
-    def rand(*shape: int) -> torch.Tensor:
-        return torch.rand(count, *shape, generator=generator)
-
-    def flags() -> torch.Tensor:
-        return torch.zeros(count, 1, dtype=torch.bool)
-
-    disc = torch.nn.functional.normalize(rand(2) - 0.5, dim=-1)
-    rest = 2 * rand(3) - 1
-    following = {"depth": 0.32 * rand(1, size, size), "holding": rand(1).round()}
-    following |= {"reward": rand(1).round(), "done": flags(), "terminated": flags()}
-    following["truncated"] = flags()
-    return TensorDict(
-        {
-            "depth": 0.32 * rand(1, size, size),
-            "holding": rand(1).round(),
-            "action": torch.cat([rest[:, :1], disc, rest[:, 1:]], -1),
-            "expert": flags(),
-            "next": following,
-        },
-        [count],
-    )
+from tests.transitions import transitions
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -60,13 +35,13 @@ def test_without_copies_what_is_sampled_is_what_was_stored():
 
 def test_paper_setting_fits_in_memory_with_small_depth_error():
     buffer = make_replay_buffer(100_000, copies=4, generator=generator())
-    stored = transitions(3, size=128)
+    stored = transitions(3, image_size=128)
     buffer.extend(stored)
     rows = buffer.storage[:3]
     bytes_a_row = sum(leaf.nbytes for leaf in rows.values(True, True)) / 3
     assert buffer.storage.max_size == 20_000
     assert bytes_a_row * buffer.storage.max_size <= 1.5e9
-    packed = QuantizeDepth()
+    packed = QuantizeDepth(0.32)
     error = (packed.forward(packed.inv(stored.clone()))["depth"] - stored["depth"]).abs().max()
     assert error < 2e-4
 
@@ -97,14 +72,14 @@ def test_copies_turn_observation_next_observation_and_action_together():
 
 def test_versions_are_drawn_uniformly_and_angles_cover_the_circle():
     buffer = make_replay_buffer(50_000, copies=4, batch_size=5000, generator=generator())
-    buffer.extend(transitions(2000, size=2))
+    buffer.extend(transitions(2000, image_size=2))
     angles = buffer.storage[:][RotationAugmentation.ANGLES]
     assert (angles[:, 0] == 0).all()
     drawn = angles[:, 1:] / math.tau
     assert drawn.min() >= 0 and drawn.max() < 1
     assert abs(drawn.mean() - 0.5) < 0.02 and abs(drawn.var() - 1 / 12) < 0.005
     batch = buffer.sample()
-    stored = transitions(2000, size=2)[batch["index"]]
+    stored = transitions(2000, image_size=2)[batch["index"]]
     unturned = (batch["action"] == stored["action"]).all(-1).float().mean()
     assert abs(unturned - 1 / 5) < 0.03
 

@@ -28,7 +28,7 @@ def env():
 
 def test_a_recording_is_what_the_environment_gives_and_gets(env):
     frames = record(env, make_expert(env), seed=3, side=32)
-    assert len(frames) - 1 == play(env, make_expert(env), 3).length
+    assert len(frames) - 1 == play(env, make_expert(env), seed=3).length
     assert [frame.reward for frame in frames] == [0.0] * (len(frames) - 1) + [1.0]
     assert frames[0].holding is False and frames[-1].holding is True
     assert frames[-1].action is None
@@ -63,7 +63,7 @@ def frames_of(film: Path, side: int) -> np.ndarray:
 
 def test_a_film_has_a_frame_for_the_start_and_each_step(env, tmp_path):
     film = film_policy(env, make_expert(env), [0, 1], tmp_path / "film.mp4", fps=5)
-    lengths = [play(env, make_expert(env), seed).length for seed in (0, 1)]
+    lengths = [play(env, make_expert(env), seed=seed).length for seed in (0, 1)]
     pictures = frames_of(film, 384)
     assert len(pictures) == sum(lengths) + 2
     scene, depth = np.hsplit(pictures[0], 2)

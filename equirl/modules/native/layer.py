@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.autograd.function import once_differentiable
 
-from equirl.modules.fields import FieldType
+from equirl.modules.fields import REGULAR, FieldType
 from equirl.modules.filters import expanded_filter
 from equirl.modules.native.library import load
 from equirl.modules.native.spectral import SpectralBasis, plain_tensors, spectral_basis
@@ -126,7 +126,7 @@ def channel_order(fields: FieldType) -> Tensor | None:
 
     The kernels keep the channels of a field coset by coset of C4 or D4.
     """
-    basis = spectral_basis(fields.group, "regular")
+    basis = spectral_basis(fields.group, REGULAR)
     assert basis is not None
     if basis.cosets == 1:
         return None

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from equirl.modules.bases import kernel_basis
-from equirl.modules.fields import element_key
+from equirl.modules.fields import REGULAR, TRIVIAL, element_key
 from equirl.symmetry import Element, SymmetryGroup
 
 __all__ = ["SpectralBasis", "plain_tensors", "spectral_basis"]
@@ -110,14 +110,14 @@ def spectral_basis(group: SymmetryGroup, in_field: str) -> SpectralBasis | None:
         The basis, or None where there is none: the group lacks the quarter turns, the
         input is of another kind, or the filters leave the span of the six functions.
     """
-    if group.rotations % 4 or in_field not in ("regular", "trivial"):
+    if group.rotations % 4 or in_field not in (REGULAR, TRIVIAL):
         return None
-    basis = kernel_basis(group, in_field, "regular", 3)
+    basis = kernel_basis(group, in_field, REGULAR, 3)
     if basis is None:
         return None
     subgroup = SymmetryGroup("D4" if group.reflections else "C4")
     channels = _coset_channels(group, subgroup)
-    regular, cosets = in_field == "regular", group.rotations // 4
+    regular, cosets = in_field == REGULAR, group.rotations // 4
     order, order_in = subgroup.order, subgroup.order if regular else 1
     filters = basis.elements[:, channels]
     if regular:

@@ -1,0 +1,81 @@
+"""What the Hydra command lines share: each mistake of a user's ends in one sentence.
+
+Imported before torch, for whose threads it sets the environment.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from hydra.types import RunMode
+from omegaconf import DictConfig
+
+from equirl.config import ConfigError, explain, register, to_config
+
+Job = TypeVar("Job")
+
+os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL logs to the standard output
+# Threads that wait for one another soon sleep: where other work keeps a core busy, spinning
+# makes two threads ten times slower than one.
+os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra hands its errors on; they are told below
+
+_log = logging.StreamHandler()  # for the package's own messages, to the standard error
+_failed: list[str] = []  # jobs of a multirun, each with its reason
+
+
+def entry_point(name: str, schema: type[Job]) -> Callable[[Callable[[Job], None]], Callable]:
+    """Makes a command line of a function that takes a validated job.
+
+    Args:
+        name: The file of ``conf`` it starts from.
+        schema: The form of its keys, a dataclass of `equirl.config`.
+    """
+
+    def decorate(main: Callable[[Job], None]) -> Callable[[], None]:
+        def job(values: DictConfig) -> None:
+            logging.getLogger("equirl").addHandler(_log)
+            logging.getLogger("equirl").setLevel(logging.INFO)
+            try:
+                main(to_config(values, schema))
+            except _mendable() as error:
+                if not is_multirun():
+                    sys.exit(f"error: {error}")
+                print(f"error: {error}", file=sys.stderr, flush=True)
+                _failed.append(f"{' '.join(HydraConfig.get().overrides.task)}: {error}")
+
+        def run() -> None:
+            register()
+            conf = Path(__file__).parents[1] / "conf"
+            try:
+                hydra.main(version_base="1.3", config_path=str(conf), config_name=name)(job)()
+            except HydraException as error:
+                sys.exit(f"error: {explain(error, schema)}")
+            if _failed:
+                sys.exit("\n".join([f"{len(_failed)} jobs failed:", *_failed]))
+
+        return run
+
+    return decorate
+
+
+def is_multirun() -> bool:
+    """Whether the present job is one of a multirun."""
+    return HydraConfig.get().mode == RunMode.MULTIRUN
+
+
+def _mendable() -> tuple[type[Exception], ...]:
+    """Errors that say by themselves what the user can do."""
+    from equirl.collectors import DemonstrationError
+    from equirl.envs import PlacementError
+    from equirl.training import CheckpointError, FolderError
+
+    return ConfigError, FolderError, CheckpointError, DemonstrationError, PlacementError
