@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 from equirl.envs import make_env, make_expert
 from equirl.envs.tasks import TASKS
@@ -21,11 +21,7 @@ from equirl.symmetry.audit_quantities import shown
 from equirl.symmetry.audit_result import markdown_table
 
 #: How the expert limits (x, y) of an action; random actions fill the box.
-ACTIONS: dict[str, Literal["norm", "box"] | None] = {
-    "random": None,
-    "expert": "norm",
-    "expert_box": "box",
-}
+ACTIONS = {"random": None, "expert": "norm", "expert_box": "box"}
 
 
 def main() -> None:

@@ -1,5 +1,7 @@
 """Simulated manipulation as TorchRL environments, with scripted experts."""
 
+from equirl.envs.action import Action
+from equirl.envs.bullet import ROBOTS
 from equirl.envs.factory import make_env, make_expert
 from equirl.envs.manipulation import ManipulationEnv
 from equirl.envs.parallel import WorkerError, make_parallel_env
@@ -7,6 +9,8 @@ from equirl.envs.scene import Scene
 from equirl.envs.tasks import PlacementError
 
 __all__ = [
+    "ROBOTS",
+    "Action",
     "ManipulationEnv",
     "PlacementError",
     "Scene",

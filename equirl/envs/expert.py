@@ -12,16 +12,19 @@ from scipy.spatial.transform import Rotation
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
+from equirl.envs.action import Action
 from equirl.envs.scene import Scene
 
 if TYPE_CHECKING:
     from equirl.envs.manipulation import ManipulationEnv
 
-__all__ = ["CLOSED", "HALF_OPEN", "NARROW", "OPEN", "Expert", "box_yaw", "nearest_symmetric_yaw"]
+__all__ = ["NARROW", "NEAR", "Expert", "box_yaw", "nearest_symmetric_yaw"]
 
-OPEN, HALF_OPEN, CLOSED = 1.0, 0.0, -1.0
 # A gripper narrower than this (m) has not come to grasp: the diagonal of the 5 cm cube is 0.071 m.
 NARROW = 0.072
+# Within this (m, rad) the gripper counts as being at a way-point. Chosen: over the 5 cm cube, each
+# finger of the open gripper has 15 mm to spare.
+NEAR, _NEAR_YAW = 0.012, 0.1
 
 
 class Expert(TensorDictModuleBase):
@@ -75,8 +78,8 @@ class Expert(TensorDictModuleBase):
         return self._env[0]
 
     @abstractmethod
-    def plan(self, scene: Scene, held: int | None) -> np.ndarray:
-        """Returns the action for a state, shape (5,)."""
+    def plan(self, scene: Scene, held: int | None) -> Action:
+        """Returns the action for a state."""
 
     def begin(self, rng: np.random.Generator) -> None:
         """Forgets the last episode; ``rng`` serves all draws of the new one."""
@@ -90,9 +93,14 @@ class Expert(TensorDictModuleBase):
         action = self.plan(env.get_scene(), env.held_object())
         return tensordict.set("action", torch.tensor(action, dtype=torch.float32))
 
+    def is_over(self, scene: Scene, place: np.ndarray, yaw: float) -> bool:
+        """Tells whether the gripper is over a way-point (x, y), m, with its ``yaw``, rad."""
+        apart = np.hypot(*(scene.position[:2] - place))
+        return bool(apart < NEAR and abs(scene.yaw - yaw) < _NEAR_YAW)
+
     def toward(
         self, scene: Scene, position: np.ndarray, yaw: float, gripper: float, arrived: float
-    ) -> np.ndarray:
+    ) -> Action:
         """Returns the action that goes to a way-point as far as one action can.
 
         Args:
@@ -101,20 +109,16 @@ class Expert(TensorDictModuleBase):
             yaw: Yaw at the way-point, rad.
             gripper: Gripper component on the way.
             arrived: Gripper component of the action that lands on the way-point.
-
-        Returns:
-            The action, shape (5,).
         """
         space = self.env.workspace
-        full = np.empty(4)
-        full[:3] = (space.clip(position) - scene.position) / space.position_step
-        full[3] = (yaw - scene.yaw) / space.yaw_step
+        way = space.clip(position) - scene.position
+        full = np.array(Action.moving(way, yaw - scene.yaw, gripper, space)[1:])
         clipped = np.clip(full, -1, 1)
         if self.options["horizontal_clip"] == "norm":
             # A hair inside the disc, so that rounding to float32 stays within it.
             clipped[:2] = full[:2] / max(1.0, np.hypot(*full[:2]) * (1 + 1e-6))
         lands = np.allclose(clipped, full, atol=1e-2)
-        return np.array([arrived if lands else gripper, *clipped])
+        return Action(arrived if lands else gripper, *clipped.tolist())
 
 
 def nearest_symmetric_yaw(yaw: float, reference: float, period: float) -> float:

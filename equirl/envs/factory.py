@@ -7,10 +7,11 @@ from typing import Any
 
 from torchrl.envs import EnvBase
 
+from equirl.envs.bullet import ROBOTS
 from equirl.envs.expert import Expert
 from equirl.envs.manipulation import ManipulationEnv
 from equirl.envs.tasks import Task, make_task
-from equirl.envs.workspace import Workspace
+from equirl.envs.workspace import WORKSPACE
 
 __all__ = ["make_env", "make_expert"]
 
@@ -30,17 +31,17 @@ def make_env(
     ``functools.partial(make_env, ...)`` can be pickled and sent to worker processes.
 
     Args:
-        task: ``"block_picking"``, ``"clutter_grasping"``, ``"block_pushing"``,
-            ``"block_in_bowl"``, or one of your own: its class, or ``"package.module:Class"``.
+        task: A name in `equirl.envs.tasks.TASKS`, or one of your own: its class, or
+            ``"package.module:Class"``.
         image_size: Pixels along a side of the depth image, even.
         seed: Seed of the first episode, as given to ``set_seed``.
-        robot: ``"panda"``: the arm, as in the paper; ``"hand"``: its hand alone, free: faster,
-            and its motion commutes with turns of the scene.
+        robot: A name in `equirl.envs.ROBOTS`: ``"panda"``, the arm, as in the paper; ``"hand"``,
+            its hand alone, free: faster, and its motion commutes with turns of the scene.
         max_steps: Length of an episode without success.
         time_limit: What the last of ``max_steps`` steps is: ``"truncate"`` (its value is
             bootstrapped) or ``"terminate"`` (as the paper's own implementation stores it).
         options: Numbers of the task, for example ``lift_height=0.12``; see the classes in
-            `equirl.envs.tasks`.
+            `equirl.envs.tasks.TASKS`.
 
     Raises:
         ValueError: If an argument is not one of these.
@@ -52,14 +53,9 @@ def make_env(
         "an even positive integer",
     )
     _require(_is_int(seed) and seed >= 0, "seed", seed, "a non-negative integer")
-    _require(robot in ("panda", "hand"), "robot", robot, "'panda' or 'hand'")
+    _require_one_of("robot", robot, tuple(ROBOTS))
     _require(_is_int(max_steps) and max_steps > 0, "max_steps", max_steps, "a positive integer")
-    _require(
-        time_limit in ("truncate", "terminate"),
-        "time_limit",
-        time_limit,
-        "'truncate' or 'terminate'",
-    )
+    _require_one_of("time_limit", time_limit, ("truncate", "terminate"))
     return ManipulationEnv(
         make_task(task, **options),
         image_size=image_size,
@@ -67,7 +63,7 @@ def make_env(
         robot=robot,
         max_steps=max_steps,
         time_limit=time_limit,
-        workspace=Workspace(),
+        workspace=WORKSPACE,
     )
 
 
@@ -96,6 +92,10 @@ def make_expert(env: EnvBase, **options: str) -> Expert:
 
 def _is_int(value: object) -> bool:
     return isinstance(value, Integral) and not isinstance(value, bool)
+
+
+def _require_one_of(name: str, value: object, allowed: tuple[str, ...]) -> None:
+    _require(value in allowed, name, value, " or ".join(map(repr, allowed)))
 
 
 def _require(valid: bool, name: str, value: object, expected: str) -> None:

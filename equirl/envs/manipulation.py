@@ -12,6 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from equirl.envs.action import Action
 from equirl.envs.bullet import Camera, Simulation
 from equirl.envs.heightmap import Heightmap, HeightmapSpec
 from equirl.envs.scene import Scene
@@ -22,6 +23,9 @@ __all__ = ["ManipulationEnv"]
 
 # Actions may exceed 1 by this much, which is rounding; they are clipped.
 _ACTION_TOLERANCE = 1e-6
+# A measured scene can be set again, so the gripper may be outside by this (m). Chosen: the worst
+# ends of moves that were measured were 1 to 4 mm off.
+_OVERSHOOT = 5e-3
 
 
 class ManipulationEnv(EnvBase):
@@ -48,7 +52,7 @@ class ManipulationEnv(EnvBase):
         task: What is to be done.
         image_size: S, pixels.
         seed: As for `set_seed`.
-        robot: ``"panda"`` or ``"hand"`` (the free hand).
+        robot: One of `equirl.envs.ROBOTS`.
         max_steps: Length of an episode without success.
         time_limit: ``"truncate"``: the last step is truncated, its value is bootstrapped;
             ``"terminate"``: it is terminal.
@@ -138,9 +142,10 @@ class ManipulationEnv(EnvBase):
         state = self._state
         if state is None or self._scene_seed is None:
             return None
-        if self._lost_object(state.scene, state.held):
+        limit = self.task.max_scene_episodes
+        if (limit and self._scene_episodes >= limit) or self._lost_object(state.scene, state.held):
             return None
-        return self.task.continued(state, self.task.succeeded(state), self._scene_episodes)
+        return self.task.continued(state, self.task.succeeded(state))
 
     def _new_scene(self, rng: np.random.Generator) -> Scene:
         task, home = self.task, self._sent_home(None)
@@ -203,11 +208,9 @@ class ManipulationEnv(EnvBase):
                 "an action is five numbers (gripper, x, y, z, theta) in [-1, 1], "
                 f"got {values.tolist()}"
             )
-        gripper, *displacement, theta = np.clip(values, -1, 1)
-        space = self.workspace
-        position = scene.position + space.position_step * np.array(displacement)
-        yaw = scene.yaw + space.yaw_step * theta
-        return space.clip(position), yaw, space.max_aperture * (gripper + 1) / 2
+        wanted, space = Action(*np.clip(values, -1, 1).tolist()), self.workspace
+        position = space.clip(scene.position + wanted.displacement(space))
+        return position, scene.yaw + wanted.turn(space), wanted.aperture(space)
 
     def _lost_object(self, scene: Scene, held: int | None) -> bool:
         return any(
@@ -272,7 +275,7 @@ class ManipulationEnv(EnvBase):
             ValueError: If the scene has objects or areas that the task does not have, or the
                 gripper is outside the workspace.
         """
-        if not self.workspace.contains(scene.position, margin=5e-3):
+        if not self.workspace.contains(scene.position, margin=_OVERSHOOT):
             raise ValueError(
                 f"the end effector at {scene.position.tolist()} (m) is outside {self.workspace}"
             )

@@ -7,9 +7,8 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-__all__ = ["Area", "Scene"]
+__all__ = ["Area", "Scene", "yaw_quaternion"]
 
 
 @dataclass(frozen=True)
@@ -116,41 +115,6 @@ class Scene:
             scales=tuple(self.scales[k] for k in kept),
         )
 
-    def turned(self, angle: float) -> Scene:
-        """Returns the scene turned by ``angle`` (rad) about the vertical through the origin.
-
-        Multiples of a quarter turn move the positions exactly (no cosine is taken).
-        """
-        turn = Rotation.from_euler("z", angle)
-        objects, areas = self.objects.copy(), self.areas.copy()
-        objects[:, :3] = _turn_points(self.objects[:, :3], angle)
-        objects[:, 3:] = _compose(turn, self.objects[:, 3:])
-        areas[:, :2] = _turn_points(self.areas[:, :2], angle)
-        areas[:, 2] += angle
-        return replace(
-            self,
-            position=_turn_points(self.position[None], angle)[0],
-            yaw=self.yaw + angle,
-            objects=objects,
-            areas=areas,
-        )
-
-    def reflected(self) -> Scene:
-        """Returns the scene mirrored in the plane y = 0.
-
-        An object's mirror image is again a pose of that object only if its own shape has the
-        mirror plane y = 0 (`Body.has_mirror_symmetry`).
-        """
-        mirror = np.array([1.0, -1.0, 1.0])
-        # M R M for M = diag(1, -1, 1): the axis is a pseudo-vector.
-        return replace(
-            self,
-            position=self.position * mirror,
-            yaw=-self.yaw,
-            objects=self.objects * (*mirror, -1.0, 1.0, -1.0, 1.0),
-            areas=self.areas * (1.0, -1.0, -1.0),
-        )
-
     def as_dict(self) -> dict[str, Any]:
         """Returns the scene as a dictionary of lists and floats, ready for JSON."""
         return {
@@ -162,6 +126,13 @@ class Scene:
     def from_dict(cls, values: Mapping[str, Any]) -> Scene:
         """Inverse of `as_dict`, bit for bit."""
         return cls(**values)
+
+
+def yaw_quaternion(yaw: float | np.ndarray) -> np.ndarray:
+    """Returns the orientations (..., 4) of upright bodies of ``yaw`` (...), rad; see `Scene`."""
+    half = np.asarray(yaw) / 2
+    zero = np.zeros_like(half)
+    return np.stack((zero, zero, np.sin(half), np.cos(half)), axis=-1)
 
 
 def _frozen(values: Any) -> np.ndarray:
@@ -179,21 +150,3 @@ def _rows(name: str, values: Any, width: int, meaning: str) -> np.ndarray:
             f"{name} must be finite rows {meaning}, got an array of shape {rows.shape}: {values!r}"
         )
     return rows
-
-
-def _turn_points(points: np.ndarray, angle: float) -> np.ndarray:
-    """Turns rows (x, y, ...) about the origin; further columns stay."""
-    quarters = round(angle / (np.pi / 2))
-    x, y, *rest = points.T
-    if abs(angle - quarters * np.pi / 2) < 1e-12:
-        x, y = ((x, y), (-y, x), (-x, -y), (y, -x))[quarters % 4]
-    else:
-        cos, sin = np.cos(angle), np.sin(angle)
-        x, y = cos * x - sin * y, sin * x + cos * y
-    return np.stack((x, y, *rest), axis=1)
-
-
-def _compose(turn: Rotation, quaternions: np.ndarray) -> np.ndarray:
-    if len(quaternions) == 0:
-        return np.zeros((0, 4))
-    return (turn * Rotation.from_quat(quaternions)).as_quat()

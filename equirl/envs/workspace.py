@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-__all__ = ["Bin", "Workspace"]
+__all__ = ["WORKSPACE", "Bin", "Workspace"]
 
 
 @dataclass(frozen=True)
@@ -77,3 +77,7 @@ class Workspace:
             max(abs(x), abs(y)) <= self.half_width + margin
             and self.z_min - margin <= z <= self.z_max + margin
         )
+
+
+#: The cell of the paper: environments have it, and numbers of tasks are measured against it.
+WORKSPACE = Workspace()

@@ -37,7 +37,9 @@ class Quantity:
         return shown(self.scale * value)
 
 
-#: What is compared, in the order of the table.
+#: What is compared, in the order of the table. The tolerances are chosen: that of ``position`` lies
+#: between the errors of a step that were measured with the free hand, 0.001 mm, and with the arm,
+#: 0.06 mm.
 QUANTITIES = {
     quantity.key: quantity
     for quantity in (

@@ -292,7 +292,7 @@ class EnvAudit:
 
 def describe(element: Element) -> str:
     """Returns ``"90°"``, ``"flip"``, ``"flip, 90°"``: first the reflection, then the turn."""
-    turn = f"{90 * (element.quarter_turns or 0)}°"
+    turn = f"{math.degrees(element.angle):g}°"
     if not element.reflected:
         return turn
     return "flip" if turn == "0°" else f"flip, {turn}"

@@ -1,8 +1,8 @@
 """How the audit turns and reflects images, actions and scenes: raw arrays, by its own arithmetic.
 
-No code is shared with what the audit checks: neither with the scenes' own `turned` and `reflected`,
-nor with the representations that networks and replay buffers are built from. Elements are those
-that map a square pixel grid onto itself.
+No code is shared with what the audit checks, nor with the representations that networks and replay
+buffers are built from. Scenes and actions are moved by any element, images by those that map a
+square pixel grid onto itself.
 """
 
 from __future__ import annotations
@@ -19,10 +19,19 @@ __all__ = ["displace_objects", "transform_action", "transform_image", "transform
 
 
 def transform_image(image: np.ndarray, element: Element) -> np.ndarray:
-    """Moves the pixels of (..., S, S), whose rows grow with x and columns with y."""
+    """Moves the pixels of (..., S, S), whose rows grow with x and columns with y.
+
+    Raises:
+        ValueError: If the element turns by other than quarter turns.
+    """
+    if element.quarter_turns is None:
+        raise ValueError(
+            "pixels are moved by quarter turns, and reflections, alone, got a turn by "
+            f"{math.degrees(element.angle):g}°"
+        )
     if element.reflected:
         image = np.flip(image, axis=-1)
-    return np.rot90(image, element.quarter_turns or 0, axes=(-2, -1))
+    return np.rot90(image, element.quarter_turns, axes=(-2, -1))
 
 
 def transform_action(action: np.ndarray, element: Element, keep_theta: bool = False) -> np.ndarray:
@@ -35,9 +44,12 @@ def transform_action(action: np.ndarray, element: Element, keep_theta: bool = Fa
 
 
 def transform_scene(values: Mapping[str, Any], element: Element) -> dict[str, Any]:
-    """Moves everything in a scene's dictionary about the vertical through the origin."""
-    plane, sign = _plane(element), -1.0 if element.reflected else 1.0
-    angle = (element.quarter_turns or 0) * math.pi / 2
+    """Moves everything in a scene's dictionary about the vertical through the origin.
+
+    The mirror image of an object is a pose of the same object only if its shape has the mirror
+    plane y = 0.
+    """
+    plane, sign, angle = _plane(element), -1.0 if element.reflected else 1.0, element.angle
     position = np.array(values["position"], dtype=np.float64)
     position[:2] = plane @ position[:2]
     objects = _rows(values["objects"], 7)
@@ -70,6 +82,7 @@ def _rows(values: Any, width: int) -> np.ndarray:
 
 
 def _plane(element: Element) -> np.ndarray:
-    """The element's matrix on (x, y): exact, its entries are 0, 1 and -1."""
-    turn = np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), element.quarter_turns or 0)
+    """The element's matrix on (x, y); with quarter turns, its entries are 0, 1 and -1."""
+    cos, sin = element.cos_sin
+    turn = np.array([[cos, -sin], [sin, cos]])
     return turn @ np.diag([1, -1]) if element.reflected else turn

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from equirl.envs import ManipulationEnv
+from equirl.envs import Action, ManipulationEnv
 from equirl.training.video import COLORS, EXPONENT, Frame
 
 if TYPE_CHECKING:
@@ -188,16 +188,17 @@ def _show_depth(axes: Axes, frame: Frame, step: int, env: ManipulationEnv) -> Ax
 def _show_action(axes: Axes, action: np.ndarray, env: ManipulationEnv) -> None:
     """Draws the displacement in x and y as an arrow and writes the rest below."""
     space = env.workspace
-    gripper, x, y, z, theta = action.tolist()
-    if math.hypot(x, y) > _STILL:
-        tip = (y * space.position_step, x * space.position_step)
+    wanted = Action(*action.tolist())
+    dx, dy, dz = wanted.displacement(space)
+    if math.hypot(wanted.x, wanted.y) > _STILL:
+        tip = (dy, dx)
         style = {"arrowstyle": "-|>", "color": _ARROW, "lw": 1.8, "shrinkA": 0, "shrinkB": 0}
         axes.annotate("", xy=tip, xytext=(0, 0), arrowprops=style)
     words = []
-    if abs(z) > _STILL:
-        words.append(f"{'↑' if z > 0 else '↓'} {100 * abs(z) * space.position_step:.1f} cm")
-    if abs(theta) > _STILL:
-        angle = math.degrees(abs(theta) * space.yaw_step)
-        words.append(f"{'↺' if theta > 0 else '↻'} {angle:.0f}°")
-    words.append(f"↔ {100 * space.max_aperture * (gripper + 1) / 2:.0f} cm")
+    if abs(wanted.z) > _STILL:
+        words.append(f"{'↑' if dz > 0 else '↓'} {100 * abs(dz):.1f} cm")
+    if abs(wanted.theta) > _STILL:
+        turn = math.degrees(wanted.turn(space))
+        words.append(f"{'↺' if turn > 0 else '↻'} {abs(turn):.0f}°")
+    words.append(f"↔ {100 * wanted.aperture(space):.0f} cm")
     _write(axes, 0, False, "   ".join(words), color=_TEXT)

@@ -5,14 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from equirl.envs import make_env
-
 
 @pytest.fixture
-def env():
-    env = make_env("block_pushing", image_size=16, robot="hand")
-    yield env
-    env.close()
+def env(make):
+    return make("block_pushing", image_size=16, robot="hand")
 
 
 def green(picture: np.ndarray) -> np.ndarray:

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterator
 from dataclasses import replace
+from types import ModuleType
 
 import numpy as np
 import pytest
-import torch
+from tensordict import TensorDictBase
 from torchrl.envs.utils import check_env_specs
 
-from equirl.envs import PlacementError, Scene, make_env
+from equirl.envs import PlacementError, Scene, make_env, make_expert, tasks
 from equirl.envs.objects import Body, ConvexPolyhedron, ObjectSet
 from equirl.envs.tasks import TASKS, State, make_task
 from equirl.envs.tasks.block_in_bowl import BlockInBowl
+from equirl.envs.tasks.block_picking import BlockPicking
 from equirl.envs.tasks.block_pushing import BlockPushing
 from equirl.envs.tasks.clutter_grasping import ClutterGrasping
 
@@ -35,38 +39,33 @@ def bricks(count: int = 1) -> ObjectSet:
 
 
 @pytest.fixture
-def clutter():
-    env = make_env("clutter_grasping", image_size=16, robot="hand", objects=bricks(3))
-    yield env
-    env.close()
+def clutter(make):
+    return make("clutter_grasping", image_size=16, robot="hand", objects=bricks(3))
 
 
-def act(env, td, *action):
-    td = td.clone().set("action", torch.tensor(action, dtype=torch.float32))
-    return env.step(td)["next"]
-
-
-def grasp(env) -> torch.Tensor:
-    """Puts the gripper around an object and lifts it; returns the reward."""
-    scene = env.get_scene()
-    pose = scene.objects[0]
-    yaw = 2 * np.arctan2(pose[5], pose[6]) + np.pi / 2
-    seed, episodes = env._scene_seed, env._scene_episodes
-    td = env.set_scene(replace(scene, position=pose[:3], yaw=yaw))
-    env._scene_seed, env._scene_episodes = seed, episodes  # the stream's episode goes on
-    td = act(env, td, -1, 0, 0, 0, 0)
+def expert_episode(env) -> Iterator[TensorDictBase]:
+    """Plays an episode of the expert, step by step."""
+    td, expert = env.reset(), make_expert(env, grasp="aligned")
     while not td["done"]:
-        td = act(env, td, -1, 0, 0, 1, 0)
-    return td["reward"]
+        td = env.step(expert(td.clone()))["next"]
+        yield td
+
+
+def test_a_file_with_two_tasks_is_refused(monkeypatch):
+    module = ModuleType("two")
+    for name in ("First", "Second"):
+        setattr(module, name, type(name, (BlockPicking,), {"__module__": "two"}))
+    monkeypatch.setitem(sys.modules, "two", module)
+    with pytest.raises(ImportError, match="two defines the tasks First, Second; expected one"):
+        tasks._task_of("two")
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_every_task_is_a_torchrl_environment(task):
-    env = make_env(task, image_size=16, robot="hand")
+def test_every_task_is_a_torchrl_environment(make, task):
+    env = make(task, image_size=16, robot="hand")
     check_env_specs(env)
     rollout = env.rollout(4)
     assert rollout["depth"].min() >= 0 and rollout["depth"].max() <= np.float32(0.32)
-    env.close()
 
 
 def test_pushing_starts_with_the_goal_apart_from_the_cube():
@@ -130,8 +129,10 @@ def test_success_of_block_in_bowl(x, orientation, held, touching, released_only,
     assert task.succeeded(state(task, objects, held=held, touching=touching)) is success
 
 
-def test_the_papers_options_do_not_ask_for_release():
-    assert BlockInBowl.paper_options == {"require_release": False}
+def test_in_the_papers_mode_a_held_cube_is_a_success():
+    task = make_task("block_in_bowl", **BlockInBowl.paper_options)
+    objects = [[0, 0, 0.04, *REST], [0, 0, 0.034, *REST]]
+    assert task.succeeded(state(task, objects, held=0, touching=True))
 
 
 def test_clutter_draws_kinds_sizes_and_places():
@@ -147,7 +148,7 @@ def test_clutter_draws_kinds_sizes_and_places():
     assert np.abs(yaws).max() <= np.pi / 4
 
 
-def test_a_heap_has_come_to_rest_within_the_bin(clutter):
+def test_a_heap_has_come_to_rest_within_the_bin(clutter, act):
     for seed in range(6):
         clutter.set_seed(seed)
         td = clutter.reset()
@@ -160,22 +161,21 @@ def test_a_heap_has_come_to_rest_within_the_bin(clutter):
 
 
 def test_a_grasped_object_is_gone_in_the_next_episode(clutter):
-    clutter.reset()
     for left in (4, 3, 2):
-        before = clutter.get_scene()
-        assert grasp(clutter) == 1
-        assert clutter.scene_continues
+        *_, end = expert_episode(clutter)
+        assert end["reward"] == 1 and clutter.scene_continues
+        rest = clutter.get_scene().without(clutter.held_object())
         clutter.reset()
         after = clutter.get_scene()
-        assert len(after.objects) == left and after.names == before.names[1:]
+        assert len(after.objects) == left and after.names == rest.names
         np.testing.assert_allclose(after.position, (0, 0, 0.2), atol=1e-6)
         assert after.aperture == pytest.approx(0.08) and clutter.held_object() is None
 
 
-def test_a_new_scene_comes_when_all_are_gone_or_after_seven_episodes_or_when_one_is_lost():
-    env = make_env("clutter_grasping", image_size=8, robot="hand", objects=bricks(), object_count=1)
-    env.reset()
-    assert grasp(env) == 1 and not env.scene_continues  # all gone
+def test_a_new_scene_comes_when_all_are_gone_or_after_seven_episodes_or_when_one_is_lost(make, act):
+    env = make("clutter_grasping", image_size=8, robot="hand", objects=bricks(), object_count=1)
+    *_, end = expert_episode(env)
+    assert end["reward"] == 1 and not env.scene_continues  # all gone
     env.reset()
     for episode in range(6):
         assert env.scene_continues, episode
@@ -188,26 +188,36 @@ def test_a_new_scene_comes_when_all_are_gone_or_after_seven_episodes_or_when_one
     env._simulation.place(lost)
     td = act(env, env.fake_tensordict().exclude("next"), 1, 0, 0, 0, 0)
     assert td["terminated"] and td["reward"] == 0 and not env.scene_continues
-    env.close()
 
 
-def test_a_scene_may_go_on_for_ever():
-    task = ClutterGrasping(objects=bricks(), object_count=1, max_scene_episodes=0)
-    end = state(task, [[0, 0, 0.02, *REST]])
-    assert task.continued(end, False, 10_000) is end.scene
-    assert ClutterGrasping(objects=bricks()).continued(end, False, 7) is None
+@pytest.mark.parametrize("limit", [0, 1, 2])
+def test_a_scene_goes_on_for_as_many_episodes_as_asked_or_for_ever(make, limit):
+    options = {"objects": bricks(), "object_count": 1, "max_scene_episodes": limit}
+    env = make("clutter_grasping", image_size=8, robot="hand", **options)
+    env.reset()
+    episodes = 1
+    while env.scene_continues and episodes < 9:
+        env.reset()
+        episodes += 1
+    assert episodes == (limit or 9)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_task_can_be_asked_for_a_new_scene_at_each_reset(make, task):
+    env = make(task, image_size=8, robot="hand", max_scene_episodes=1)
+    env.reset()
+    assert not env.scene_continues
 
 
 def test_an_object_in_the_air_at_the_end_of_an_episode_falls_before_the_next(clutter):
+    for td in expert_episode(clutter):
+        heights = clutter.get_scene().objects[:, 2]
+        if td["holding"] and heights.max() > 0.08:
+            break
+    assert not td["done"]
     clutter.reset()
-    scene = clutter.get_scene()
-    seed, episodes = clutter._scene_seed, clutter._scene_episodes
-    pose = scene.objects[0].copy()
-    pose[2] += 0.10
-    clutter.set_scene(replace(scene, objects=np.vstack((pose[None], scene.objects[1:]))))
-    clutter._scene_seed, clutter._scene_episodes = seed, episodes
-    clutter.reset()
-    assert clutter.get_scene().objects[0, 2] < pose[2] - 0.05
+    after = clutter.get_scene().objects[:, 2]
+    assert len(after) == 5 and (after < 0.06).all()
 
 
 def test_setting_a_scene_ends_the_one_that_goes_on(clutter):
@@ -216,10 +226,9 @@ def test_setting_a_scene_ends_the_one_that_goes_on(clutter):
     assert not clutter.scene_continues
 
 
-def test_every_number_can_be_set():
-    env = make_env("block_pushing", image_size=16, robot="hand", goal_side=0.2, view=0.3)
+def test_every_number_can_be_set(make):
+    env = make("block_pushing", image_size=16, robot="hand", goal_side=0.2, view=0.3)
     assert env.task.areas[0].side == 0.2 and env.task.view == 0.3
-    env.close()
     assert make_task("block_in_bowl", bowl_width=0.2).bowl.extents[0] == pytest.approx(0.2)
 
 
@@ -296,13 +305,12 @@ def test_impossible_numbers_are_named(name, options, message):
         ),
     ],
 )
-def test_impossible_scenes_end_with_the_number_of_tries_and_the_reason(name, options, message):
-    env = make_env(name, image_size=8, robot="hand", **options)
+def test_impossible_scenes_end_with_the_tries_and_the_reason(make, name, options, message):
+    env = make(name, image_size=8, robot="hand", **options)
     with pytest.raises(PlacementError, match=message):
         env.reset()
     with pytest.raises(RuntimeError, match="no scene yet; reset it first"):
         env.get_scene()
-    env.close()
 
 
 def test_numbers_may_be_of_numpy():
@@ -310,16 +318,15 @@ def test_numbers_may_be_of_numpy():
     make_env("block_picking", image_size=np.int64(16)).close(raise_if_closed=False)
 
 
-def test_scenes_may_be_wider_than_the_bin_as_long_as_some_fit():
-    env = make_env("block_picking", image_size=8, robot="hand", start_half_width=0.3)
+def test_scenes_may_be_wider_than_the_bin_as_long_as_some_fit(make):
+    env = make("block_picking", image_size=8, robot="hand", start_half_width=0.3)
     for _ in range(10):
         env.reset()
         assert env.workspace.contains(env.get_scene().objects[0, :3])
-    env.close()
 
 
-def test_scenes_of_other_tasks_are_refused():
-    env = make_env("block_pushing", image_size=8, robot="hand")
+def test_scenes_of_other_tasks_are_refused(make):
+    env = make("block_pushing", image_size=8, robot="hand")
     cube = [[0, 0, 0.025, *REST]]
     with pytest.raises(ValueError, match="the scene has 0 areas, the task has 1"):
         env.set_scene(Scene([0, 0, 0.2], 0.0, 0.08, cube))
@@ -327,25 +334,23 @@ def test_scenes_of_other_tasks_are_refused():
         env.set_scene(Scene([0, 0, 0.2], 0.0, 0.08, cube, names=["mug"], areas=[[0, 0, 0]]))
     with pytest.raises(RuntimeError, match="no scene yet; reset it first"):
         env.get_scene()
-    env.close()
 
 
-def test_scenes_that_a_task_could_not_judge_are_refused():
-    env = make_env("block_in_bowl", image_size=8, robot="hand")
+def test_scenes_that_a_task_could_not_judge_are_refused(make):
+    env = make("block_in_bowl", image_size=8, robot="hand")
     poses = [[0.05, 0, 0.034, *REST], [-0.1, 0, 0.025, *REST]]
     with pytest.raises(ValueError, match=r"has the objects \('cube',\), the task has"):
         env.set_scene(Scene([0, 0, 0.2], 0.0, 0.08, poses[:1]))
     with pytest.raises(ValueError, match=r"has the objects \('bowl', 'cube'\), the task has"):
         env.set_scene(Scene([0, 0, 0.2], 0.0, 0.08, poses, names=["bowl", "cube"]))
-    heap = make_env("clutter_grasping", image_size=8, robot="hand", objects=bricks())
+    heap = make("clutter_grasping", image_size=8, robot="hand", objects=bricks())
     with pytest.raises(ValueError, match="the scene has no object"):
         heap.set_scene(HOME)
 
 
 @pytest.mark.parametrize("size", [(0, 10), (10, -4), (10, 2.5)])
-def test_pictures_of_impossible_sizes_are_refused(size):
-    env = make_env("block_picking", image_size=8, robot="hand")
+def test_pictures_of_impossible_sizes_are_refused(make, size):
+    env = make("block_picking", image_size=8, robot="hand")
     env.reset()
     with pytest.raises(ValueError, match=r"must be a positive integer \(pixels\), got"):
         env.render(*size)
-    env.close()

@@ -15,7 +15,7 @@ from tensordict import TensorDict
 from torchrl.envs import DoubleToFloat, TransformedEnv
 
 from equirl.envs import Scene, make_env, make_expert
-from equirl.symmetry import ACTION, ScalarField, SymmetryGroup, audit_env
+from equirl.symmetry import ACTION, Element, ScalarField, SymmetryGroup, audit_env
 from equirl.symmetry.audit_result import Cause
 from equirl.symmetry.audit_transforms import transform_action, transform_image, transform_scene
 
@@ -109,30 +109,64 @@ def audited(fault=None, group="D4", **options):
     return audit_env(PointWorld(fault), group, scenes=4, steps=5, **options)
 
 
-@pytest.mark.parametrize("element", D4)
-def test_own_transformations_agree_with_the_package(element):
+def example(rng) -> Scene:
+    objects = np.concatenate((rng.normal(size=(3, 3)), Rotation.random(3, rng).as_quat()), 1)
+    return Scene(rng.normal(size=3), rng.normal(), 0.05, objects, areas=rng.normal(size=(2, 3)))
+
+
+def moved(scene, element) -> Scene:
+    return Scene.from_dict(transform_scene(scene.as_dict(), element))
+
+
+@pytest.mark.parametrize("element", SymmetryGroup("D8").elements)
+def test_scenes_move_by_the_matrix_of_the_element(element):
+    mirror = np.diag([1, -1 if element.reflected else 1, 1])
+    matrix = Rotation.from_euler("z", element.angle).as_matrix() @ mirror
+
+    def axes(yaws):
+        return np.stack((np.cos(yaws), np.sin(yaws), np.zeros_like(yaws)), -1)
+
     rng = np.random.default_rng(0)
     for _ in range(20):
-        objects = np.concatenate((rng.normal(size=(3, 3)), Rotation.random(3, rng).as_quat()), 1)
-        scene = Scene(
-            rng.normal(size=3), rng.normal(), 0.05, objects, areas=rng.normal(size=(2, 3))
-        )
-        expected = scene.reflected() if element.reflected else scene
-        expected = expected.turned(element.angle)
-        seen = Scene.from_dict(transform_scene(scene.as_dict(), element))
-        np.testing.assert_allclose(seen.position, expected.position, rtol=0, atol=0)
-        np.testing.assert_allclose(seen.objects[:, :3], expected.objects[:, :3], rtol=0, atol=0)
-        poses = (Rotation.from_quat(each.objects[:, 3:]).as_matrix() for each in (seen, expected))
-        np.testing.assert_allclose(*poses, atol=1e-12)
-        np.testing.assert_allclose(np.exp(1j * seen.yaw), np.exp(1j * expected.yaw), atol=1e-12)
-        np.testing.assert_allclose(seen.areas[:, :2], expected.areas[:, :2], rtol=0, atol=0)
-        yaws = (np.exp(1j * each.areas[:, 2]) for each in (seen, expected))
-        np.testing.assert_allclose(*yaws, atol=1e-12)
+        scene = example(rng)
+        seen = moved(scene, element)
+        assert (seen.aperture, seen.grip) == (scene.aperture, scene.grip)
+        for get in (
+            lambda each: each.position,
+            lambda each: each.objects[:, :3],
+            lambda each: axes(np.array(each.yaw)),
+            lambda each: axes(each.areas[:, 2]),
+            lambda each: each.areas * (1, 1, 0),
+        ):
+            np.testing.assert_allclose(get(seen), get(scene) @ matrix.T, atol=1e-12)
+        before, after = (Rotation.from_quat(each.objects[:, 3:]) for each in (scene, seen))
+        # A body is its own mirror image: the reflection is undone in its frame.
+        expected = matrix @ before.as_matrix() @ mirror
+        np.testing.assert_allclose(after.as_matrix(), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("element", D4)
+def test_on_the_grid_positions_are_moved_exactly(element):
+    scene = seen = example(np.random.default_rng(0))
+    for _ in range(4):
+        seen = moved(seen, element)
+    np.testing.assert_array_equal(seen.position, scene.position)
+    np.testing.assert_array_equal(seen.objects[:, :3], scene.objects[:, :3])
+    np.testing.assert_array_equal(seen.areas[:, :2], scene.areas[:, :2])
+
+
+def test_pixels_are_not_turned_by_half_a_quarter():
+    with pytest.raises(ValueError, match="quarter turns, .* got a turn by 45°"):
+        transform_image(np.zeros((4, 4)), Element(math.pi / 4))
+
+
+@pytest.mark.parametrize("element", D4)
+def test_images_and_actions_move_as_the_package_moves_them(element):
     image, action = torch.rand(1, 6, 6), torch.rand(5) * 2 - 1
     turned = transform_image(image.numpy(), element)
     assert np.array_equal(turned, ScalarField().transform(image, element).numpy())
-    moved = transform_action(action.numpy(), element)
-    np.testing.assert_allclose(moved, ACTION.transform(action, element).numpy(), atol=1e-7)
+    played = transform_action(action.numpy(), element)
+    np.testing.assert_allclose(played, ACTION.transform(action, element).numpy(), atol=1e-7)
 
 
 def test_exact_symmetry_has_no_error():

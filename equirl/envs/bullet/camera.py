@@ -9,10 +9,10 @@ import numpy as np
 from equirl.envs.bullet.client import Client
 from equirl.envs.bullet.floor import Floor, Viewpoint
 from equirl.envs.bullet.loading import load_picture
-from equirl.envs.bullet.models import RobotLoader, robot_model
+from equirl.envs.bullet.models import ROBOTS, RobotLoader
 from equirl.envs.objects import Body, ConvexPolyhedron, ObjectSet
 from equirl.envs.objects.bodies import Color
-from equirl.envs.scene import Area, Scene
+from equirl.envs.scene import Area, Scene, yaw_quaternion
 from equirl.envs.workspace import Workspace
 
 __all__ = ["Camera"]
@@ -52,7 +52,7 @@ class Camera:
         self._view = view
         self._robot: int | None = None
         if robot is not None:
-            loader = RobotLoader(self._client, robot_model(robot, workspace), visual=True)
+            loader = RobotLoader(self._client, ROBOTS[robot](workspace), visual=True)
             self._robot = loader.load()
             loader.close()
             self._color_fingers(self._robot)
@@ -117,9 +117,9 @@ class Camera:
         corners = np.array([(x, y, z) for x, z in section for y in (-x, x)])
         wall = Body((ConvexPolyhedron.hull(corners),), mass=0, friction=0, color=_WALL_COLOR)
         for quarter in range(4):
-            turn = (0, 0, np.sin(quarter * np.pi / 4), np.cos(quarter * np.pi / 4))
+            turn = yaw_quaternion(quarter * np.pi / 2)
             body = load_picture(self._client, wall)
-            self._client.resetBasePositionAndOrientation(body, (0, 0, 0), turn)
+            self._client.resetBasePositionAndOrientation(body, (0, 0, 0), turn.tolist())
 
     def _show(self, scene: Scene) -> list[int]:
         """Makes the pictures of a scene's objects, unless they are there; returns their ids."""

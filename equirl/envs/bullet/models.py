@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,7 @@ from equirl.envs.bullet.client import Client, panda_urdf
 from equirl.envs.bullet.kinematics import hand_joints, panda_joints, panda_yaw
 from equirl.envs.workspace import Workspace
 
-__all__ = ["RobotLoader", "RobotModel", "robot_model"]
+__all__ = ["ROBOTS", "RobotLoader", "RobotModel"]
 
 _HAND_LINKS = ("panda_hand", "panda_leftfinger", "panda_rightfinger", "panda_grasptarget")
 _HAND_JOINTS = ("panda_finger_joint1", "panda_finger_joint2", "panda_grasptarget_hand")
@@ -40,25 +40,28 @@ class RobotModel:
     derive: Callable[[ElementTree.Element], None]
 
 
-def robot_model(name: str, workspace: Workspace) -> RobotModel:
-    """Returns the model of ``"panda"`` (arm and hand) or ``"hand"`` (the hand alone, free)."""
-    if name == "panda":
-        return RobotModel(
-            joint_names=tuple(f"panda_joint{i}" for i in range(1, 8)),
-            base_x=workspace.arm_base_x,
-            joints=partial(panda_joints, base_x=workspace.arm_base_x),
-            yaw=panda_yaw,
-            derive=_lift_yaw_limit,
-        )
-    if name == "hand":
-        return RobotModel(
-            joint_names=("move_x", "move_y", "move_z", "turn"),
-            base_x=0.0,
-            joints=hand_joints,
-            yaw=lambda joints: float(joints[3]),
-            derive=_free_hand,
-        )
-    raise ValueError(f"unknown robot {name!r}; known: 'panda', 'hand'")
+def _panda(workspace: Workspace) -> RobotModel:
+    return RobotModel(
+        joint_names=tuple(f"panda_joint{i}" for i in range(1, 8)),
+        base_x=workspace.arm_base_x,
+        joints=partial(panda_joints, base_x=workspace.arm_base_x),
+        yaw=panda_yaw,
+        derive=_lift_yaw_limit,
+    )
+
+
+def _hand(workspace: Workspace) -> RobotModel:
+    return RobotModel(
+        joint_names=("move_x", "move_y", "move_z", "turn"),
+        base_x=0.0,
+        joints=hand_joints,
+        yaw=lambda joints: float(joints[3]),
+        derive=_free_hand,
+    )
+
+
+#: The robots by name, each made for a workspace: the arm with its hand, and the hand alone, free.
+ROBOTS: Mapping[str, Callable[[Workspace], RobotModel]] = {"panda": _panda, "hand": _hand}
 
 
 class RobotLoader:

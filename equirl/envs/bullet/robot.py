@@ -21,18 +21,28 @@ __all__ = [
     "Robot",
 ]
 
+# The paper's implementation has these forces and this friction.
 ARM_FORCE = 240.0  # N or N m
 GRIPPER_FORCE = 10.0  # N, each finger
 FINGER_FRICTION = 1.0
-FINGER_SPEED = 0.2  # m/s
-MOVE_STEPS = 24  # simulation steps of one move: 0.2 s
-MIN_GRIP_STEPS = 4  # for the arm to come to rest where it was sent, too
-MAX_GRIP_STEPS = 40
+FINGER_SPEED = 0.2  # m/s, the limit in the Panda's description
+# Simulation steps of one move: 0.2 s. Measured: moves of 0.1 s fling away what they push.
+MOVE_STEPS = 24
+# Measured: without these the arm was seen up to 2 mm short of where it was sent.
+MIN_GRIP_STEPS = 4
+MAX_GRIP_STEPS = 40  # chosen: closing takes 24 at full speed
 # Strong as it is, the arm would press a cube through the floor. When the contacts push harder than
 # this, it takes a little of the move back and tries again, a few times: what can give way does.
+# Chosen, all three.
 FORCE_LIMIT = 40.0  # N
 _RETREAT_STEPS = 4
 _ATTEMPTS = 5
+# Chosen: the fingers are where they should be within this (m), or stand still when both were slower
+# than this (m/s) for so many steps.
+_ARRIVED, _STILL_SPEED, _STILL_STEPS = 5e-4, 2e-3, 3
+# Of the motors of the arm. Chosen; the paper's implementation has a position gain of 0.02 and takes
+# some 200 steps a move.
+_POSITION_GAIN, _VELOCITY_GAIN = 0.3, 1.0
 _FINGER_JOINTS = ("panda_finger_joint1", "panda_finger_joint2")
 
 
@@ -79,6 +89,7 @@ class Robot:
             parentFramePosition=(0, 0, 0),
             childFramePosition=(0, 0, 0),
         )
+        # The numbers are those of the paper's implementation.
         self._client.changeConstraint(gear, gearRatio=-1, erp=0.1, maxForce=50)
 
     def pose(self) -> tuple[np.ndarray, float, float]:
@@ -152,13 +163,13 @@ class Robot:
         still = 0
         for count in range(MAX_GRIP_STEPS):
             states = self._client.getJointStates(self.body, self.fingers)
-            there = abs(states[0][0] + states[1][0] - aperture) < 5e-4
+            there = abs(states[0][0] + states[1][0] - aperture) < _ARRIVED
             if there and count >= MIN_GRIP_STEPS:
                 return
             step()
             states = self._client.getJointStates(self.body, self.fingers)
-            still = still + 1 if max(abs(s[1]) for s in states) < 2e-3 else 0
-            if still >= 3 and count + 1 >= MIN_GRIP_STEPS:
+            still = still + 1 if max(abs(s[1]) for s in states) < _STILL_SPEED else 0
+            if still >= _STILL_STEPS and count + 1 >= MIN_GRIP_STEPS:
                 return
 
     def drive_gripper(self, aperture: float) -> None:
@@ -183,6 +194,6 @@ class Robot:
             targetPositions=joints.tolist(),
             targetVelocities=velocities.tolist(),
             forces=[ARM_FORCE] * count,
-            positionGains=[0.3] * count,
-            velocityGains=[1.0] * count,
+            positionGains=[_POSITION_GAIN] * count,
+            velocityGains=[_VELOCITY_GAIN] * count,
         )

@@ -23,7 +23,7 @@ from equirl.envs.objects.convex_pieces import (
     require_libraries,
     sides_text,
 )
-from equirl.envs.objects.object_set import ObjectSet
+from equirl.envs.objects.object_set import FRICTION, MASS, MESH_ROLLING, ObjectSet
 
 __all__ = ["NATURAL_SIDE", "SUFFIXES", "MeshFolder"]
 
@@ -86,9 +86,9 @@ class MeshFolder(ObjectSet):
         self,
         path: str | os.PathLike[str],
         *,
-        mass: float = 0.15,
-        friction: float = 0.6,
-        rolling_friction: float = 0.001,
+        mass: float = MASS,
+        friction: float = FRICTION,
+        rolling_friction: float = MESH_ROLLING,
         max_grasp_width: float = 0.07,
         scale: float | None = None,
         max_pieces: int = 16,

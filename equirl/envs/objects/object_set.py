@@ -7,7 +7,14 @@ from collections.abc import Iterable, Iterator, Mapping
 
 from equirl.envs.objects.bodies import Body
 
-__all__ = ["ObjectSet"]
+__all__ = ["FRICTION", "HOUSEHOLD_ROLLING", "MASS", "MESH_ROLLING", "ObjectSet"]
+
+# Of objects to grasp. Mass, friction and the rolling friction of the household objects are those of
+# the paper's implementation; of meshes, the rolling friction is chosen.
+MASS = 0.15  # kg
+FRICTION = 0.6
+HOUSEHOLD_ROLLING = 0.005  # m; so that round objects come to rest
+MESH_ROLLING = 0.001  # m
 
 
 class ObjectSet(Mapping[str, Body]):

@@ -10,10 +10,12 @@ from typing import Any
 
 from equirl.envs.tasks.base import PlacementError, State, Task, lying, rejection_sample
 from equirl.envs.tasks.block_task import BlockTask
+from equirl.envs.tasks.lift_task import LiftTask
 
 __all__ = [
     "TASKS",
     "BlockTask",
+    "LiftTask",
     "PlacementError",
     "State",
     "Task",
@@ -25,12 +27,19 @@ __all__ = [
 
 
 def _task_of(module: str) -> type[Task] | None:
-    """Returns the task a module defines; None if it holds what tasks share."""
+    """Returns the task a module defines; None if it holds what tasks share.
+
+    Raises:
+        ImportError: If it defines several.
+    """
     tasks = [
         each
         for _, each in getmembers(import_module(module), isclass)
         if issubclass(each, Task) and each.__module__ == module and not isabstract(each)
     ]
+    if len(tasks) > 1:
+        names = ", ".join(task.__name__ for task in tasks)
+        raise ImportError(f"{module} defines the tasks {names}; expected one a file")
     return tasks[0] if tasks else None
 
 

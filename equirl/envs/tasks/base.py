@@ -12,13 +12,11 @@ import numpy as np
 
 from equirl.envs.expert import Expert
 from equirl.envs.objects import Body, ObjectSet
-from equirl.envs.scene import Area, Scene
-from equirl.envs.workspace import Workspace
+from equirl.envs.scene import Area, Scene, yaw_quaternion
 
-__all__ = ["WORKSPACE", "PlacementError", "State", "Task", "lying", "rejection_sample"]
+__all__ = ["PlacementError", "State", "Task", "lying", "rejection_sample"]
 
 _BATCH = 256  # points drawn at a time
-WORKSPACE = Workspace()  # what numbers of a task are measured against
 
 
 class PlacementError(RuntimeError):
@@ -51,13 +49,18 @@ class Task(ABC):
         margin: An object that is not held and leaves the workspace by more than this (m) ends the
             episode.
         start_half_width: Positions are drawn within +-this of the centre, m.
+        start_yaw: Yaws are drawn within +-this, rad.
         placement_tries: Draws of a scene before `PlacementError`.
+        max_scene_episodes: A scene is given up after so many episodes, of which each reset begins
+            one: with 1, each draws a new scene. 0: when `continued` says so.
     """
 
     view: float = 0.30
     margin: float = 0.0
     start_half_width: float = 0.09
+    start_yaw: float = np.pi / 4
     placement_tries: int = 20_000
+    max_scene_episodes: int = 0
 
     #: Options that the paper's own implementation runs with, for ``mode=paper``.
     paper_options: ClassVar[Mapping[str, Any]] = {}
@@ -68,7 +71,7 @@ class Task(ABC):
 
     def __post_init__(self) -> None:
         self.require_positive("view", "placement_tries")
-        self.require_non_negative("margin", "start_half_width")
+        self.require_non_negative("margin", "start_half_width", "start_yaw", "max_scene_episodes")
 
     @property
     @abstractmethod
@@ -99,13 +102,14 @@ class Task(ABC):
         """The task's scripted planner, if it has one."""
         return None
 
-    def continued(self, state: State, succeeded: bool, episodes: int) -> Scene | None:
+    def continued(self, state: State, succeeded: bool) -> Scene | None:
         """Returns what the next episode of the same scene starts with.
+
+        It is not asked when an object was lost, or after `max_scene_episodes`.
 
         Args:
             state: The end of the last episode.
             succeeded: Whether that was a success.
-            episodes: Episodes played on this scene so far.
 
         Returns:
             The scene (its gripper is sent home), or None for a new scene: the default.
@@ -177,4 +181,4 @@ def rejection_sample(
 def lying(body: Body, x: float, y: float, yaw: float) -> np.ndarray:
     """Returns the pose (7,) of ``body`` on the floor, upright, at (x, y) m and ``yaw`` rad."""
     lowest = body.vertices[:, 2].min()
-    return np.array([x, y, -lowest, 0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)])
+    return np.array([x, y, -lowest, *yaw_quaternion(yaw)])

@@ -9,7 +9,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from equirl.envs.expert import CLOSED, NARROW, OPEN, Expert, box_yaw, nearest_symmetric_yaw
+from equirl.envs.action import CLOSED, OPEN, Action
+from equirl.envs.expert import NARROW, NEAR, Expert, box_yaw, nearest_symmetric_yaw
 from equirl.envs.objects import Body, ObjectSet, bowl
 from equirl.envs.scene import Scene
 from equirl.envs.tasks.base import State, lying
@@ -98,29 +99,31 @@ class BlockInBowl(BlockTask):
 class BlockInBowlExpert(Expert):
     """Stateless: the way-point follows from the state, so what fails is tried again."""
 
-    _above = 0.10  # m over the cube, and over the bowl
-    _near = 0.012  # m, what counts as being at a way-point
-    _over_bowl = 0.03  # m, where the cube would fall into it
+    _above = 0.10  # m over the cube, and over the bowl, as in the paper's implementation
 
-    def plan(self, scene: Scene, held: int | None) -> np.ndarray:
-        """Returns the action for a state, shape (5,)."""
+    @property
+    def _reach(self) -> float:
+        """Within this of the bowl's centre, in x and y, the cube is in it, or falls into it, m."""
+        return self.env.task.reach  # type: ignore[attr-defined]  # of a `BlockInBowl`
+
+    def plan(self, scene: Scene, held: int | None) -> Action:
+        """Returns the action for a state."""
         cube, bowl = scene.objects
         if held == 0:
             return self._carry(scene, bowl)
-        inside = np.hypot(*(cube[:2] - bowl[:2])) < self._over_bowl
+        inside = np.hypot(*(cube[:2] - bowl[:2])) < self._reach
         if scene.aperture < NARROW or inside:
-            return np.array([OPEN, 0.0, 0.0, 1.0, 0.0])
+            return Action(OPEN, z=1.0)
         yaw = nearest_symmetric_yaw(box_yaw(cube[3:]), scene.yaw, np.pi / 2)
-        apart = np.hypot(*(scene.position[:2] - cube[:2]))
-        if apart < self._near and abs(scene.yaw - yaw) < 0.1:
+        if self.is_over(scene, cube[:2], yaw):
             return self.toward(scene, cube[:3], yaw, gripper=OPEN, arrived=CLOSED)
         above = cube[:3] + (0, 0, self._above)
         return self.toward(scene, above, yaw, gripper=OPEN, arrived=OPEN)
 
-    def _carry(self, scene: Scene, bowl: np.ndarray) -> np.ndarray:
+    def _carry(self, scene: Scene, bowl: np.ndarray) -> Action:
         above = bowl[:3] + (0, 0, self._above)
-        low = scene.position[2] < above[2] - self._near
-        if low and np.hypot(*(scene.position[:2] - above[:2])) > self._over_bowl:
+        low = scene.position[2] < above[2] - NEAR
+        if low and np.hypot(*(scene.position[:2] - above[:2])) > self._reach:
             above[:2] = scene.position[:2]  # first up, then across
             return self.toward(scene, above, scene.yaw, gripper=CLOSED, arrived=CLOSED)
         return self.toward(scene, above, scene.yaw, gripper=CLOSED, arrived=OPEN)

@@ -7,7 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from equirl.envs.expert import HALF_OPEN, Expert, nearest_symmetric_yaw
+from equirl.envs.action import HALF_OPEN, Action
+from equirl.envs.expert import Expert, nearest_symmetric_yaw
 from equirl.envs.objects import ObjectSet
 from equirl.envs.scene import Area, Scene
 from equirl.envs.tasks.base import State
@@ -79,15 +80,15 @@ class BlockPushing(BlockTask):
 class BlockPushingExpert(Expert):
     """Stateless: pushes along the line from the cube to the goal, and again until it is there."""
 
-    _travel_height = 0.11  # m: the fingers clear the cube
-    _push_height = 0.03  # m
-    _behind = 0.08  # m from the cube's centre, where the push begins
-    _short = 0.035  # m short of the goal, where it ends
-    _near = 0.012  # m, what counts as being at a way-point
-    _lane = 0.02  # m to either side of the line, where a push may go on
+    # The paper's implementation has the first four (m).
+    _travel_height = 0.11  # the fingers clear the cube
+    _push_height = 0.03
+    _behind = 0.08  # from the cube's centre, where the push begins
+    _short = 0.035  # of the goal, where it ends
+    _lane = 0.02  # m to either side of the line, where a push may go on; chosen: in the cube's face
 
-    def plan(self, scene: Scene, held: int | None) -> np.ndarray:
-        """Returns the action for a state, shape (5,)."""
+    def plan(self, scene: Scene, held: int | None) -> Action:
+        """Returns the action for a state."""
         (cube,), (goal,) = scene.objects, scene.areas
         line = goal[:2] - cube[:2]
         direction = line / max(np.hypot(*line), 1e-9)
@@ -104,7 +105,7 @@ class BlockPushingExpert(Expert):
             target = (*(goal[:2] - self._short * direction), self._push_height)
         elif low:
             target = (*scene.position[:2], self._travel_height)
-        elif np.hypot(*(scene.position[:2] - start)) < self._near and abs(scene.yaw - yaw) < 0.1:
+        elif self.is_over(scene, start, yaw):
             target = (*start, self._push_height)
         else:
             target = (*start, self._travel_height)

@@ -8,7 +8,8 @@ from functools import cached_property
 import numpy as np
 
 from equirl.envs.objects import Body, cube
-from equirl.envs.tasks.base import WORKSPACE, Task, lying, rejection_sample
+from equirl.envs.tasks.base import Task, lying, rejection_sample
+from equirl.envs.workspace import WORKSPACE
 
 __all__ = ["BlockTask"]
 
@@ -21,18 +22,16 @@ class BlockTask(Task):
         cube_side: M.
         cube_mass: Kg.
         cube_friction: Lateral friction.
-        start_yaw: The cube's yaw is drawn within +-this, rad.
     """
 
     cube_side: float = 0.05
     cube_mass: float = 0.1
     cube_friction: float = 1.0
-    start_yaw: float = np.pi / 4
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.require_positive("cube_side", "cube_mass")
-        self.require_non_negative("cube_friction", "start_yaw")
+        self.require_non_negative("cube_friction")
         self.require_below("cube_side", WORKSPACE.max_aperture, "the opening of the gripper (m)")
 
     @cached_property

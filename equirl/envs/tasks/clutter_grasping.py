@@ -11,10 +11,14 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from equirl.envs.expert import CLOSED, OPEN, Expert, nearest_symmetric_yaw
+from equirl.envs.action import CLOSED, OPEN, Action
+from equirl.envs.expert import Expert, nearest_symmetric_yaw
+from equirl.envs.heightmap import HeightmapSpec
 from equirl.envs.objects import MeshFolder, ObjectSet, household_objects
-from equirl.envs.scene import Scene
-from equirl.envs.tasks.base import WORKSPACE, State, Task
+from equirl.envs.scene import Scene, yaw_quaternion
+from equirl.envs.tasks.base import State
+from equirl.envs.tasks.lift_task import LiftTask
+from equirl.envs.workspace import WORKSPACE
 
 __all__ = ["ClutterGrasping", "ClutterGraspingExpert"]
 
@@ -23,7 +27,7 @@ _HIGHEST_DROP = 0.35  # m
 
 
 @dataclass(frozen=True, kw_only=True)
-class ClutterGrasping(Task):
+class ClutterGrasping(LiftTask):
     """Objects of a set lie in the bin; success is holding any of them high enough.
 
     The object grasped is taken away and the next episode goes on with the others. There is a new
@@ -36,33 +40,24 @@ class ClutterGrasping(Task):
         smallest_scale: The size of each object is drawn from this ...
         largest_scale: ... to this, relative to the set's.
         drop_height: Objects are dropped from here, one by one, m.
-        start_yaw: Yaws are drawn within +-this, rad.
-        lift_height: The end effector must be above this, m.
-        max_scene_episodes: A scene is given up after so many episodes, of which each reset begins
-            one; 0: never.
     """
 
     margin: float = 0.05
     start_half_width: float = 0.10
     placement_tries: int = 20
+    max_scene_episodes: int = 7
     objects: str | Path | ObjectSet = "household"
     names: Sequence[str] = ()
     object_count: int = 5
     smallest_scale: float = 0.8
     largest_scale: float = 1.0
     drop_height: float = 0.20
-    start_yaw: float = np.pi / 4
-    lift_height: float = 0.15
-    max_scene_episodes: int = 7
 
     drops_objects = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.require_positive("object_count", "smallest_scale", "largest_scale", "lift_height")
-        self.require_positive("drop_height")
-        self.require_non_negative("start_yaw", "max_scene_episodes")
-        self.require_below("lift_height", WORKSPACE.z_max, "the top of the workspace (m)")
+        self.require_positive("object_count", "smallest_scale", "largest_scale", "drop_height")
         self.require_below("drop_height", _HIGHEST_DROP, "or objects would touch the robot (m)")
         self.require(
             "largest_scale",
@@ -100,30 +95,24 @@ class ClutterGrasping(Task):
         kinds = list(self.bodies)
         names = tuple(kinds[k] for k in rng.integers(len(kinds), size=count))
         scales = tuple(rng.uniform(self.smallest_scale, self.largest_scale, size=count))
-        poses = np.zeros((count, 7))
-        poses[:, :2] = rng.uniform(-self.start_half_width, self.start_half_width, size=(count, 2))
-        poses[:, 2] = self.drop_height
+        places = rng.uniform(-self.start_half_width, self.start_half_width, size=(count, 2))
         yaws = rng.uniform(-self.start_yaw, self.start_yaw, size=count)
-        poses[:, 5], poses[:, 6] = np.sin(yaws / 2), np.cos(yaws / 2)
+        heights = np.full(count, self.drop_height)
+        poses = np.column_stack((places, heights, yaw_quaternion(yaws)))
         return replace(home, objects=poses, names=names, scales=scales)
 
-    def succeeded(self, state: State) -> bool:
-        """Tells whether an object is held high enough."""
-        return state.held is not None and state.scene.position[2] > self.lift_height
-
-    def continued(self, state: State, succeeded: bool, episodes: int) -> Scene | None:
-        """Returns what is left of the scene, or None when it is done with."""
-        if self.max_scene_episodes and episodes >= self.max_scene_episodes:
-            return None
+    def continued(self, state: State, succeeded: bool) -> Scene | None:
+        """Returns what is left of the scene, or None when nothing is."""
         scene = state.scene
         if succeeded and state.held is not None:
             scene = scene.without(state.held)
         return scene if len(scene.objects) > 0 else None
 
 
-# Open fingers, from above: their distance from the middle, half their side with some room, and
-# how far they reach below the centre of an object at a grasp, m.
-_FINGER_CENTRE, _FINGER_REACH, _FINGER_DEPTH = 0.0475, 0.013, 0.02
+# Open fingers, from above: their distance from the middle, half their side with some room (chosen),
+# and how far they reach below the centre of an object at the deepest grasp, m.
+_FINGER_CENTRE = WORKSPACE.max_aperture / 2 + HeightmapSpec.finger_length / 2
+_FINGER_REACH, _FINGER_DEPTH = 0.013, 0.02
 
 
 @dataclass
@@ -145,39 +134,40 @@ class ClutterGraspingExpert(Expert):
 
     CHOICES: ClassVar = {**Expert.CHOICES, "grasp": ("random", "aligned")}
 
-    _on_top = 0.027  # m: an object is not on top if the centre of a higher one is as near
-    _deepest = 0.02  # m, the grasp is lowered by up to this
-    _clear = 0.07  # m, height from which the next object is approached
-    _reach = 0.05  # m, horizontal distance from which it comes down
-    _stuck = 0.004  # m: a move shorter than this was broken off
+    # The first two are those of the paper's implementation, the others chosen (m).
+    _on_top = 0.027  # an object is not on top if the centre of a higher one is as near
+    _deepest = 0.02  # the grasp is lowered by up to this
+    _clear = 0.07  # height from which the next object is approached
+    _reach = 0.05  # horizontal distance from which it comes down: one action covers it
+    _stuck = 0.004  # a move shorter than this was broken off
 
     def begin(self, rng: np.random.Generator) -> None:
         """Forgets the last episode."""
         self._rng = rng
         self._attempt: _Attempt | None = None
 
-    def plan(self, scene: Scene, held: int | None) -> np.ndarray:
-        """Returns the action for a state, shape (5,)."""
+    def plan(self, scene: Scene, held: int | None) -> Action:
+        """Returns the action for a state."""
         if held is not None:
-            return np.array([CLOSED, 0.0, 0.0, 1.0, 0.0])
+            return Action(CLOSED, z=1.0)
         if self._attempt is None or self._attempt.closed:
             failed = None if self._attempt is None else self._attempt.target
             self._attempt = self._choose(scene, failed)
         return self._approach(scene, self._attempt)
 
-    def _approach(self, scene: Scene, attempt: _Attempt) -> np.ndarray:
+    def _approach(self, scene: Scene, attempt: _Attempt) -> Action:
         where = scene.objects[attempt.target, :3] - (0, 0, attempt.lowering)
         above = np.hypot(*(where[:2] - scene.position[:2])) < self._reach
         moved = np.inf if attempt.last is None else np.linalg.norm(scene.position - attempt.last)
         first, attempt.last = attempt.last is None, scene.position
         if moved < self._stuck:  # something is in the way: grasp what is there
-            action = np.array([CLOSED, 0.0, 0.0, 0.0, 0.0])
+            action = Action(CLOSED)
         elif above and not (first and scene.position[2] < self._clear):
             action = self.toward(scene, where, attempt.yaw, gripper=OPEN, arrived=CLOSED)
         else:  # over the others
             where[2] = self._clear
             action = self.toward(scene, where, attempt.yaw, gripper=OPEN, arrived=OPEN)
-        attempt.closed = action[0] == CLOSED
+        attempt.closed = action.gripper == CLOSED
         return action
 
     def _choose(self, scene: Scene, failed: int | None) -> _Attempt:

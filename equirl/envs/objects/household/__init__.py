@@ -7,14 +7,10 @@ from functools import lru_cache
 
 from equirl.envs.objects.bodies import Body
 from equirl.envs.objects.household.kinds import KINDS, Kind
-from equirl.envs.objects.object_set import ObjectSet
+from equirl.envs.objects.object_set import FRICTION, HOUSEHOLD_ROLLING, MASS, ObjectSet
 
 __all__ = ["KINDS", "Kind", "household_objects"]
 
-MASS = 0.15  # kg
-FRICTION = 0.6
-# So that round objects come to rest (m).
-ROLLING_FRICTION = 0.005
 _METRES = 0.01  # of a centimetre
 
 
@@ -40,6 +36,6 @@ def _body(name: str, kind: Kind, variant: int) -> Body:
         mass=MASS,
         friction=FRICTION,
         name=f"{name}_{variant}",
-        rolling_friction=ROLLING_FRICTION,
+        rolling_friction=HOUSEHOLD_ROLLING,
         color=(red, green, blue, 1.0),
     )
