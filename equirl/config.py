@@ -263,7 +263,7 @@ class WatchJob:
     episodes: int = _at_least(3, 1)
     sheet_episodes: int = _at_least(3, 1)  # the first ones, shown on the contact sheet
     seed: int = _at_least(0, 0)
-    output: str = ""  # a folder for film and sheet; outputs/watch/<task> when empty
+    output: str = ""  # a folder for film and sheet; outputs/watch/<task>/<policy> when empty
     fps: int = _at_least(4, 1)  # steps a second
     # Pixels a side of each of the film's two pictures; video formats want an even number.
     size: int = _checked(384, lambda value: value >= 2 and value % 2 == 0, "2 or more, even")
@@ -392,11 +392,14 @@ def load_config(path: Path) -> Config:
     """
     try:
         values = OmegaConf.load(path)
+        if not OmegaConf.is_dict(values):
+            raise ConfigError(f"{path} is not a configuration: expected keys and values")
+        return to_config(values)
     except FileNotFoundError:
         raise ConfigError(f"{path} not found: not the folder of a run") from None
-    except (OSError, YAMLError) as error:
-        raise ConfigError(f"{path} is not a readable configuration: {error}") from None
-    return to_config(values)
+    except (OSError, UnicodeError, YAMLError) as error:
+        reason = " ".join(str(error).split())
+        raise ConfigError(f"{path} is not a readable configuration: {reason}") from None
 
 
 def flatten(config: Any, prefix: str = "") -> dict[str, Any]:

@@ -9,39 +9,47 @@ their folders. Writes ``curves.png``, ``runs.csv`` and ``table.md``.
 from __future__ import annotations
 
 import argparse
-import csv
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from equirl.analysis import read_table, wilson_interval
 from equirl.analysis.curves import plot_runs
+from equirl.analysis.tables import markdown_table, write_table
 
 
-def main() -> None:
+def main(arguments: list[str] | None = None) -> None:
     """Writes curves and tables."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("output", type=Path)
-    parser.add_argument("groups", nargs="+", metavar="LABEL=FOLDER[,FOLDER...]")
+    parser.add_argument("groups", nargs="+", type=group, metavar="LABEL=FOLDER[,FOLDER...]")
     parser.add_argument("--title", default="")
-    arguments = parser.parse_args()
-    groups: dict[str, list[Path]] = {}
-    for text in arguments.groups:
-        label, _, folders = text.partition("=")
-        groups[label] = [Path(folder) for folder in folders.split(",") if folder]
-        for folder in groups[label]:
-            if not (folder / "test.csv").exists():
-                parser.error(f"{folder} is not the folder of a finished run")
-    arguments.output.mkdir(parents=True, exist_ok=True)
-    plot_runs(groups, arguments.output / "curves.png", title=arguments.title)
+    given = parser.parse_args(arguments)
+    groups: dict[str, Sequence[Path]] = {}
+    for label, folders in given.groups:
+        groups[label] = [*groups.get(label, ()), *folders]
     rows = [summary(label, folder) for label, folders in groups.items() for folder in folders]
-    with open(arguments.output / "runs.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    names = list(rows[0])
-    lines = [f"| {' | '.join(names)} |", f"| {' | '.join('---' for _ in names)} |"]
-    lines += [f"| {' | '.join(str(value) for value in row.values())} |" for row in rows]
-    (arguments.output / "table.md").write_text("\n".join(lines) + "\n")
-    print("\n".join(lines))
+    table = markdown_table(rows[0], (row.values() for row in rows))
+    try:
+        given.output.mkdir(parents=True, exist_ok=True)
+        plot_runs(groups, given.output / "curves.png", title=given.title)
+        write_table(given.output / "runs.csv", rows)
+        (given.output / "table.md").write_text(table + "\n")
+    except OSError as error:
+        sys.exit(f"error: cannot write to {given.output}: {error}")
+    print(table)
+
+
+def group(text: str) -> tuple[str, list[Path]]:
+    """A label and the folders of runs, from the command line."""
+    label, _, names = text.partition("=")
+    folders = [Path(name) for name in names.split(",") if name]
+    if not label or not folders:
+        raise argparse.ArgumentTypeError(f"expected LABEL=FOLDER[,FOLDER...], got {text!r}")
+    for folder in folders:
+        if "success" not in read_table(folder / "test.csv"):
+            raise argparse.ArgumentTypeError(f"{folder} is not the folder of a finished run")
+    return label, folders
 
 
 def summary(label: str, folder: Path) -> dict[str, str | int]:

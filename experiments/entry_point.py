@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import NoReturn, TypeVar
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
@@ -41,7 +41,11 @@ def entry_point(name: str, schema: type[Job]) -> Callable[[Callable[[Job], None]
     """
 
     def decorate(main: Callable[[Job], None]) -> Callable[[], None]:
+        composed = False
+
         def job(values: DictConfig) -> None:
+            nonlocal composed
+            composed = True
             logging.getLogger("equirl").addHandler(_log)
             logging.getLogger("equirl").setLevel(logging.INFO)
             try:
@@ -53,11 +57,17 @@ def entry_point(name: str, schema: type[Job]) -> Callable[[Callable[[Job], None]
                 _failed.append(f"{' '.join(HydraConfig.get().overrides.task)}: {error}")
 
         def run() -> None:
+            nonlocal composed
+            composed = False
             register()
             conf = Path(__file__).parents[1] / "conf"
             try:
                 hydra.main(version_base="1.3", config_path=str(conf), config_name=name)(job)()
-            except HydraException as error:
+            except KeyboardInterrupt:
+                stop("stopped")
+            except Exception as error:
+                if composed:
+                    raise
                 sys.exit(f"error: {explain(error, schema)}")
             if _failed:
                 sys.exit("\n".join([f"{len(_failed)} jobs failed:", *_failed]))
@@ -65,6 +75,14 @@ def entry_point(name: str, schema: type[Job]) -> Callable[[Callable[[Job], None]
         return run
 
     return decorate
+
+
+def stop(message: str) -> NoReturn:
+    """Ends the process as an interrupt does; a further one cannot spoil its last words."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    print(message, file=sys.stderr, flush=True)
+    sys.exit(130)
 
 
 def is_multirun() -> bool:

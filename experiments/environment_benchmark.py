@@ -7,22 +7,21 @@ little; those of several, by the clock on the wall.
 from __future__ import annotations
 
 import argparse
-import ctypes
-import gc
 import os
 import statistics
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from pathlib import Path
+from multiprocessing import active_children
 from typing import Any, NamedTuple
 from unittest import mock
 
 import numpy as np
 import torch
 from earlier_way import EarlierWay
+from measuring import free_memory, mebibytes, print_header, print_row, ratio
 from torchrl.envs import EnvBase
 
 from equirl.envs import ManipulationEnv, Scene, make_env, make_expert, make_parallel_env
@@ -30,15 +29,15 @@ from equirl.envs.bullet import Simulation, models
 from equirl.envs.bullet.client import Client
 from equirl.envs.bullet.robot import Robot
 from equirl.envs.heightmap import Heightmap
+from equirl.envs.tasks import TASKS
 
-TASKS = ("block_picking", "block_pushing", "block_in_bowl", "clutter_grasping")
+ROBOTS = ("panda", "hand")
 _TURNS = 5  # ours plays an episode so many times for once the earlier way
 #: Every reset draws a new scene, also in the task that goes on with what is left.
-_NEW_SCENES = {"clutter_grasping": {"max_scene_episodes": 1}}
+_NEW_SCENES: dict[str, dict[str, Any]] = {"clutter_grasping": {"max_scene_episodes": 1}}
 
 #: What takes the time of a step: methods, and PyBullet's functions by name.
 _METHODS = (
-    (Robot, "_resistance", "contacts"),
     (Simulation, "held", "contacts"),
     (Simulation, "touching", "contacts"),
     (Robot, "pose", "poses"),
@@ -52,6 +51,7 @@ _METHODS = (
 )
 _FUNCTIONS = {
     "stepSimulation": "simulation",
+    "getContactPoints": "contacts",
     "setJointMotorControlArray": "motors",
     "setJointMotorControl2": "motors",
     "getJointStates": "poses",
@@ -76,24 +76,22 @@ def environment(arguments: argparse.Namespace) -> None:
         f"alone. The earlier way plays the same scenes and the same actions, in turns, {rounds} "
         f"rounds; ratios are medians of a round's (smallest to largest). Resets draw new scenes.\n"
     )
-    print(
-        "| task | robot | steps/s | with the expert | earlier way | times as fast "
-        "| its camera left out | reset ms | 95 % below |"
-    )
-    print("| --- " * 9 + "|")
+    speeds = ("steps/s", "with the expert", "earlier way", "times as fast", "its camera left out")
+    print_header("task", "robot", *speeds, "reset ms", "95 % below")
     for task in TASKS:
         played = _play_rounds(task, rounds, arguments)
         move, see = (np.array(seconds) for seconds in played.pop("earlier way"))
         for robot, seconds in played.items():
             step, expert = (np.array(part) for part in seconds)
             resets = _resets(task, robot, arguments)
-            cells = [
+            print_row(
+                task,
+                robot,
                 *(f"{1 / np.median(each):.0f}" for each in (step, step + expert)),
                 f"{1 / np.median(move + see):.1f}",
-                *(_spread(each / step) for each in (move + see, move)),
+                *(ratio(each, step) for each in (move + see, move)),
                 *(f"{1e3 * np.quantile(resets, level):.1f}" for level in (0.5, 0.95)),
-            ]
-            print(f"| {task} | {robot} | {' | '.join(cells)} |")
+            )
 
 
 def profile(arguments: argparse.Namespace) -> None:
@@ -103,22 +101,22 @@ def profile(arguments: argparse.Namespace) -> None:
         "arm presses, what is held and what touches; poses: reading joints and objects; TorchRL: "
         "tensors, specs and what wraps a step; rest: Python of ours. The expert is beside them.\n"
     )
-    columns = ["simulation steps", "ms a step", *(f"{part} %" for part in _PARTS), "expert ms"]
-    print(f"| task | robot | {' | '.join(columns)} |")
-    print("| --- " * (len(columns) + 2) + "|")
+    shares = (f"{part} %" for part in _PARTS)
+    print_header("task", "robot", "simulation steps", "ms a step", *shares, "expert ms")
     for task in TASKS:
-        for robot in ("panda", "hand"):
+        for robot in ROBOTS:
             watch = _Stopwatch()
             with _watched(watch):
                 steps, expert = _play_watched(watch, task, robot, arguments)
             whole = sum(watch.seconds.values())
-            cells = [
+            print_row(
+                task,
+                robot,
                 f"{watch.calls['simulation'] / steps:.1f}",
                 f"{1e3 * whole / steps:.2f}",
                 *(f"{100 * watch.seconds[part] / whole:.0f}" for part in _PARTS),
                 f"{1e3 * expert / steps:.2f}",
-            ]
-            print(f"| {task} | {robot} | {' | '.join(cells)} |")
+            )
 
 
 def scaling(arguments: argparse.Namespace) -> None:
@@ -129,24 +127,19 @@ def scaling(arguments: argparse.Namespace) -> None:
         f"resets included, on {cores} cores with a load average of {load:.2f}. Memory is what a "
         "worker has for itself (USS).\n"
     )
-    print("| task | environments | start-up s | steps/s | times one's | MiB a worker |")
-    print("| --- " * 6 + "|")
+    measured = ("start-up s", "steps/s", "times one's", "MiB a worker")
+    print_header("task", "environments", *measured)
     for task in TASKS:
         alone: float | None = None
         for workers in (0, *arguments.workers):
             start_up, speed, memory = _parallel(task, workers, arguments)
             alone = alone or speed
             name = f"{workers} workers" if workers else "1 in process"
-            cells = f"{start_up:.2f} | {speed:.0f} | {speed / alone:.2f} | {memory}"
-            print(f"| {task} | {name} | {cells} |")
-    print(f"\n| task | growth of RSS in {arguments.steps} resets, MiB |")
-    print("| --- | --- |")
+            print_row(task, name, f"{start_up:.2f}", f"{speed:.0f}", f"{speed / alone:.2f}", memory)
+    print()
+    print_header("task", f"growth of RSS in {arguments.steps} resets, MiB")
     for task in TASKS:
-        print(f"| {task} | {_growth(task, arguments):.1f} |")
-
-
-def _spread(ratios: np.ndarray) -> str:
-    return f"{np.median(ratios):.3g} ({ratios.min():.3g} to {ratios.max():.3g})"
+        print_row(task, f"{_growth(task, arguments):.1f}")
 
 
 class _Played(NamedTuple):
@@ -163,14 +156,13 @@ def _play_rounds(task: str, rounds: int, arguments: argparse.Namespace) -> dict[
     of seeing.
     """
     source = make_env(task, image_size=16)
-    robots = ("panda", "hand")
-    envs = {robot: make_env(task, image_size=arguments.image, robot=robot) for robot in robots}
+    envs = {robot: make_env(task, image_size=arguments.image, robot=robot) for robot in ROBOTS}
     earlier = EarlierWay(source.task, arguments.image, arguments.camera)
-    seconds: dict[str, Any] = {name: ([], []) for name in (*robots, "earlier way")}
+    seconds: dict[str, Any] = {name: ([], []) for name in (*ROBOTS, "earlier way")}
     for number, scene in zip(range(-1, rounds), _scenes(source), strict=False):
-        played: dict[str, list[_Played]] = {robot: [] for robot in robots}
+        played: dict[str, list[_Played]] = {robot: [] for robot in ROBOTS}
         for _ in range(_TURNS if number >= 0 else 1):
-            for robot in robots:
+            for robot in ROBOTS:
                 played[robot].append(_play(envs[robot], scene))
         if number < 0:  # compiled and loaded now
             _replay(earlier, scene, played["panda"][0].actions[:1])
@@ -182,8 +174,9 @@ def _play_rounds(task: str, rounds: int, arguments: argparse.Namespace) -> dict[
         replayed = _replay(earlier, scene, played["panda"][0].actions)
         for mine, part in zip(seconds["earlier way"], replayed, strict=True):
             mine.append(part)
-    for each in (source, *envs.values(), earlier):
-        each.close()
+    for env in (source, *envs.values()):
+        env.close()
+    earlier.close()
     return seconds
 
 
@@ -245,7 +238,7 @@ class _Stopwatch:
     """Adds up the time that parts take, without that of parts inside them, while it runs."""
 
     def __init__(self) -> None:
-        self.seconds: Counter[str] = Counter()
+        self.seconds: defaultdict[str, float] = defaultdict(float)
         self.calls: Counter[str] = Counter()
         self.runs = False
         self._inside = [0.0]
@@ -324,7 +317,7 @@ def _parallel(task: str, workers: int, arguments: argparse.Namespace) -> tuple[f
     seconds = time.perf_counter() - start
     memory = "-"
     if workers:
-        private = [_memory(process.pid, "Private") for process in env._workers]
+        private = [mebibytes(f"{each.pid}/smaps_rollup", "Private") for each in active_children()]
         memory = f"{statistics.median(private):.0f}"
     env.close()
     return start_up, count * max(workers, 1) / seconds, memory
@@ -337,14 +330,7 @@ def _growth(task: str, arguments: argparse.Namespace) -> float:
     for resets in (max(1, arguments.steps // 10), arguments.steps):  # the first are not counted
         for _ in range(resets):
             env.reset()
-        gc.collect()
-        ctypes.CDLL(None).malloc_trim(0)
-        sizes.append(_memory(os.getpid(), "Rss"))
+        free_memory()
+        sizes.append(mebibytes("self/smaps_rollup", "Rss"))
     env.close()
     return sizes[1] - sizes[0]
-
-
-def _memory(process: int, field: str) -> float:
-    """Returns the sum of a process's fields of memory whose names begin with ``field``, MiB."""
-    lines = Path(f"/proc/{process}/smaps_rollup").read_text().splitlines()[1:]
-    return sum(int(line.split()[1]) for line in lines if line.startswith(field)) / 2**10

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import warnings
+from typing import cast
 
 import torch
 from tensordict import TensorDictBase
@@ -53,13 +54,9 @@ def escnn_convolution(ours: SteerableConv | SteerableLinear) -> enn.R2Conv:
         escnn_type(ours.out_type),
         ours.kernel_size,
         padding=getattr(ours, "padding", 0),
-        bias=ours.bias is not None,
         initialize=False,
     )
-    with torch.no_grad():
-        for mine, its in ((ours.weights, theirs.weights), (ours.bias, theirs.bias)):
-            if mine is not None:
-                its.copy_(mine)
+    theirs.load_state_dict(theirs.state_dict() | ours.state_dict())  # it has buffers besides
     return theirs
 
 
@@ -68,9 +65,10 @@ class EscnnEncoder(nn.Module):
 
     def __init__(self, ours: EquivariantEncoder):
         super().__init__()
-        self.image_size, self.out_type, modules = ours.image_size, ours.out_type, []
+        self.image_size, self.out_type = ours.image_size, ours.out_type
+        modules: list[enn.EquivariantModule] = []
         for layer, pool in zip(ours.layers, ours.pools, strict=True):
-            convolution = escnn_convolution(layer)
+            convolution = escnn_convolution(cast(SteerableConv, layer))
             modules += [convolution, enn.ReLU(convolution.out_type, inplace=True)]
             modules += [enn.PointwiseMaxPool(convolution.out_type, 2)] if pool else []
         self.layers = enn.SequentialModule(*modules)
@@ -100,14 +98,16 @@ class EscnnQHeads(nn.Module):
         super().__init__()
         self.heads = nn.ModuleList()
         for hidden, value in zip(_split(ours.hidden, len(ours.values)), ours.values, strict=True):
-            first, last = escnn_convolution(hidden), escnn_convolution(value)
+            first = escnn_convolution(hidden)
+            last = escnn_convolution(cast(SteerableLinear, value))
             between = enn.ReLU(first.out_type, inplace=True), enn.GroupPooling(first.out_type)
             self.heads.append(enn.SequentialModule(first, *between, last))
 
     def forward(self, features: Tensor, action: Tensor) -> Tensor:
         """Maps features (B, size) and actions (B, 5) to values (B, heads)."""
         x = torch.cat([features, action], -1)[..., None, None]
-        return torch.cat([head(head.in_type(x)).tensor.flatten(1) for head in self.heads], -1)
+        heads = cast(list[enn.SequentialModule], list(self.heads))
+        return torch.cat([head(head.in_type(x)).tensor.flatten(1) for head in heads], -1)
 
 
 class Critic(nn.Module):
@@ -132,7 +132,8 @@ def escnn_policy(ours: EquivariantPolicy) -> EquivariantPolicy:
 
 def escnn_critic(ours: Critic) -> Critic:
     """A copy of our critic in escnn's modules."""
-    return Critic(EscnnEncoder(ours.encoder), EscnnQHeads(ours.heads)).train()
+    encoder, heads = cast(EquivariantEncoder, ours.encoder), cast(EquivariantQHeads, ours.heads)
+    return Critic(EscnnEncoder(encoder), EscnnQHeads(heads)).train()
 
 
 class TextbookSAC:
@@ -217,7 +218,9 @@ def _split(joint: SteerableLinear, heads: int) -> list[SteerableLinear]:
             of_block = joint.weights.detach()[start : start + block.size]
             weights.append(of_block.chunk(heads)[head])
             start += block.size
-        part.weights.data = torch.cat(weights)
-        part.bias.data = joint.bias.detach().chunk(heads)[head].clone()
+        state = {"weights": torch.cat(weights)}
+        if joint.bias is not None:
+            state["bias"] = joint.bias.detach().chunk(heads)[head]
+        part.load_state_dict(state)
         parts.append(part)
     return parts

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from entry_point import entry_point
 
-from equirl.config import EvaluateJob
+from equirl.config import ConfigError, EvaluateJob
 
 
 @entry_point("evaluate", EvaluateJob)
@@ -29,7 +29,9 @@ def main(job: EvaluateJob) -> None:
         scene_seed,
     )
 
-    config, policy = load_policy(Path(job.run), job.device, job.backend)
+    if job.video and Path(job.video).suffix != ".mp4":
+        raise ConfigError(f"video={job.video}: expected the name of an .mp4 file")
+    config, policy = load_policy(job.run, job.device, job.backend)
     numbers = range(job.first, job.first + job.episodes)
     seeds = [scene_seed(config.seed, Purpose.TEST, number) for number in numbers]
     device = config.torch_device

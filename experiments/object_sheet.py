@@ -15,6 +15,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from command_line import at_least
 
 from equirl.envs.bullet import Camera
 from equirl.envs.bullet.floor import Viewpoint
@@ -31,15 +32,14 @@ GAP, CAPTION, FOOT = 0.04, 0.15, 0.15  # inches
 
 def main(arguments: list[str] | None = None) -> None:
     """Reads the objects and writes the sheet."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--meshes", type=Path, help="a folder of OBJ and STL files")
     parser.add_argument("--output", type=Path, required=True, help="the PNG file to write")
-    parser.add_argument("--columns", type=int, default=12, help="objects in a row")
-    parser.add_argument("--size", type=int, default=96, help="pixels a side of each picture")
+    parser.add_argument("--columns", type=at_least(1), default=12, help="objects in a row")
+    parser.add_argument("--size", type=at_least(1), default=96, help="pixels a side of a picture")
     given = parser.parse_args(arguments)
-    for name in ("columns", "size"):
-        if getattr(given, name) < 1:
-            parser.error(f"argument --{name}: expected 1 or more, got {getattr(given, name)}")
+    if given.output.suffix.lower() != ".png":
+        parser.error(f"argument --output: expected a PNG file, got {given.output}")
     try:
         objects = MeshFolder(given.meshes) if given.meshes else household_objects()
         draw_objects(objects, given.output, given.columns, given.size)

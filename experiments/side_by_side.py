@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import argparse
 import copy
-import ctypes
-import gc
 import os
-import statistics
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -17,9 +13,18 @@ from typing import Any
 
 import torch
 from escnn_reference import Critic, EscnnEncoder, TextbookSAC, escnn_critic, escnn_policy
+from measuring import (
+    free_memory,
+    mebibytes,
+    milliseconds,
+    print_header,
+    print_row,
+    ratio,
+    run_config,
+    take_turns,
+)
 from tensordict import TensorDict
 
-from equirl.config import to_config
 from equirl.modules import (
     EquivariantEncoder,
     NativeUnavailable,
@@ -47,15 +52,15 @@ def kernels(arguments: argparse.Namespace) -> None:
         f"{arguments.repeats} rounds; ratios are medians of a round's (smallest to largest)\n"
     )
     variants = available(UPDATES, arguments.group)
-    print("| hidden | update | ms | times as fast as escnn | as the row above |")
-    print("| --- | --- | --- | --- | --- |")
+    print_header("hidden", "update", "ms", "times as fast as escnn", "as the row above")
     for hidden in arguments.hidden:
         updates = {name: _update(name, hidden, *_setting(arguments)) for name in variants}
         seconds = take_turns(updates, arguments.repeats)
-        for name, above in zip(variants, [None, *variants], strict=False):
+        above = ""
+        for name in variants:
             others = [ratio(seconds[other], seconds[name]) for other in ("escnn", above) if above]
-            cells = " | ".join([milliseconds(seconds[name]), *(others or ["1", "-"])])
-            print(f"| {hidden} | {UPDATES[name]} | {cells} |")
+            print_row(hidden, UPDATES[name], milliseconds(seconds[name]), *(others or ["1", "-"]))
+            above = name
 
 
 def peak(arguments: argparse.Namespace) -> None:
@@ -67,8 +72,7 @@ def peak(arguments: argparse.Namespace) -> None:
     """
     print(f"{arguments.group}, {arguments.image} x {arguments.image}, batch {arguments.batch}\n")
     variants = available(UPDATES, arguments.group)
-    print("| hidden | update | process MiB | of escnn's | update MiB | of escnn's |")
-    print("| --- | --- | --- | --- | --- | --- |")
+    print_header("hidden", "update", "process MiB", "of escnn's", "update MiB", "of escnn's")
     for hidden in arguments.hidden:
         escnn: tuple[float, float] | None = None
         for name in variants:
@@ -76,9 +80,10 @@ def peak(arguments: argparse.Namespace) -> None:
                 setting = name, hidden, *_setting(arguments), arguments.threads
                 used = pool.submit(_peak_of_updates, *setting).result()
             escnn = escnn or used
-            pairs = zip(used, escnn, strict=True)
-            cells = " | ".join(f"{mine:.0f} | {mine / its:.0%}" for mine, its in pairs)
-            print(f"| {hidden} | {UPDATES[name]} | {cells} |")
+            cells: list[str] = []
+            for mine, its in zip(used, escnn, strict=True):
+                cells += [f"{mine:.0f}", f"{mine / its:.0%}"]
+            print_row(hidden, UPDATES[name], *cells)
 
 
 def threads(arguments: argparse.Namespace) -> None:
@@ -86,15 +91,14 @@ def threads(arguments: argparse.Namespace) -> None:
     cores, load = len(os.sched_getaffinity(0)), os.getloadavg()[0]
     print(f"Load average {load:.2f} on {cores} cores: two threads need two idle cores.\n")
     variants = available(["learner"], arguments.group)
-    print("| hidden | update | 1 thread ms | 2 threads ms | times as fast |")
-    print("| --- | --- | --- | --- | --- |")
+    print_header("hidden", "update", "1 thread ms", "2 threads ms", "times as fast")
     for hidden in arguments.hidden:
         for name in variants:
             update = _update(name, hidden, *_setting(arguments))
             calls = {count: _on_threads(count, update) for count in (1, 2)}
             seconds = take_turns(calls, arguments.repeats)
-            cells = f"{milliseconds(seconds[1])} | {milliseconds(seconds[2])}"
-            print(f"| {hidden} | {UPDATES[name]} | {cells} | {ratio(seconds[1], seconds[2])} |")
+            cells = map(milliseconds, seconds.values())
+            print_row(hidden, UPDATES[name], *cells, ratio(seconds[1], seconds[2]))
     torch.set_num_threads(arguments.threads)
 
 
@@ -103,8 +107,7 @@ def layers(arguments: argparse.Namespace) -> None:
     print(f"{arguments.group}, {arguments.image} x {arguments.image}, batch {arguments.batch}\n")
     backends = available(["escnn", "dense", "native"], arguments.group)
     columns = [*(f"{name} ms" for name in backends), *(f"escnn / {name}" for name in backends[1:])]
-    print(f"| hidden | pass | {' | '.join(columns)} |")
-    print("| --- " * (len(columns) + 2) + "|")
+    print_header("hidden", "pass", *columns)
     batch = _random_batch(arguments.image, arguments.batch)
     observation = batch["depth"], batch["holding"]
     for hidden in arguments.hidden:
@@ -114,10 +117,10 @@ def layers(arguments: argparse.Namespace) -> None:
             seconds = take_turns(calls, arguments.repeats)
             cells = [milliseconds(seconds[name]) for name in backends]
             cells += [ratio(seconds["escnn"], seconds[name]) for name in backends[1:]]
-            print(f"| {hidden} | {title} | {' | '.join(cells)} |")
+            print_row(hidden, title, *cells)
 
 
-def available(variants: Sequence[str] | dict[str, str], group: str) -> list[str]:
+def available(variants: Iterable[str], group: str) -> list[str]:
     """Those of the variants that this machine can run."""
     try:
         resolve_backend("native", SymmetryGroup(group))
@@ -125,32 +128,6 @@ def available(variants: Sequence[str] | dict[str, str], group: str) -> list[str]
         print(f"{error}\n")
         return [name for name in variants if name not in ("native", "learner")]
     return list(variants)
-
-
-def take_turns(calls: dict, repeats: int, warm_up: int = 1) -> dict[object, list[float]]:
-    """Seconds of each call in each round, the calls taking turns within it.
-
-    Whatever else slows the machine down slows all of a round, so that the ratios of one
-    round's times hold where the times themselves do not.
-    """
-    seconds: dict[object, list[float]] = {name: [] for name in calls}
-    for _ in range(warm_up + repeats):
-        for name, call in calls.items():
-            start = time.perf_counter()
-            call()
-            seconds[name].append(time.perf_counter() - start)
-    return {name: times[warm_up:] for name, times in seconds.items()}
-
-
-def milliseconds(seconds: list[float]) -> str:
-    """The median, in milliseconds."""
-    return f"{1e3 * statistics.median(seconds):.1f}"
-
-
-def ratio(slower: list[float], faster: list[float]) -> str:
-    """The median of the rounds' ratios, and their range."""
-    ratios = [a / b for a, b in zip(slower, faster, strict=True)]
-    return f"{statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})"
 
 
 def _setting(arguments: argparse.Namespace) -> tuple[str, int, int]:
@@ -161,16 +138,7 @@ def _update(variant: str, hidden: int, group: str, image: int, size: int) -> Cal
     """A function that makes one update, always on the same batch."""
     batch = _random_batch(image, size)
     if variant == "learner":
-        config = {
-            "env": {"task": "block_picking", "image_size": image},
-            "method": {"name": "equivariant", "hidden": hidden},
-            "algorithm": {"name": "sac"},
-            "augmentation": {"name": "buffer"},
-            "group": group,
-            "backend": "native",
-            "device": "cpu",
-        }
-        learner = Learner(to_config(config))
+        learner = Learner(run_config(group, image, hidden, backend="native"))
         return lambda: learner.update(batch.copy())
     backend = "native" if variant == "native" else "dense"
     made: dict[str, Any] = {
@@ -240,17 +208,10 @@ def _peak_of_updates(
     torch.set_num_threads(threads)
     _update(variant, 8, group, 16, 8)()  # loads what is loaded at first use
     update = _update(variant, hidden, group, image, size)
-    gc.collect()
-    ctypes.CDLL(None).malloc_trim(0)  # memory freed after building would hide what updates take
-    rest = _resident("VmRSS")
+    free_memory()  # of building, which would hide what updates take
+    rest = mebibytes("self/status", "VmRSS")
     Path("/proc/self/clear_refs").write_text("5")  # the peak is counted from here
     for _ in range(3):
         update()
-    highest = _resident("VmHWM")
+    highest = mebibytes("self/status", "VmHWM")
     return highest, highest - rest
-
-
-def _resident(field: str) -> float:
-    status = Path("/proc/self/status").read_text().splitlines()
-    (line,) = (line for line in status if line.startswith(field + ":"))
-    return int(line.split()[1]) / 2**10

@@ -7,11 +7,10 @@ python experiments/train.py resume=outputs/my_run
 
 from __future__ import annotations
 
-import sys
 from datetime import datetime
 from pathlib import Path
 
-from entry_point import entry_point, is_multirun
+from entry_point import entry_point, is_multirun, stop
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
@@ -37,9 +36,12 @@ def main(job: TrainJob) -> None:
     except KeyboardInterrupt:
         outcome = None
     if outcome is None:
-        again = f"python experiments/train.py 'resume=\"{folder}\"'"
-        print(f"stopped; go on with: {again}", file=sys.stderr)
-        sys.exit(130)
+        if is_multirun():
+            sweep = HydraConfig.get().sweep.dir
+            again = f"the same command and 'hydra.sweep.dir=\"{sweep}\"'"
+        else:
+            again = f"python experiments/train.py 'resume=\"{folder}\"'"
+        stop(f"stopped; go on with {again}")
     print(outcome)
     print(f"report: {folder / REPORT}")
 

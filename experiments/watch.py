@@ -32,7 +32,7 @@ def main(job: WatchJob) -> None:
         config, policy = Config(env=job.env), None
     else:
         _check_run(job.policy)
-        config, policy = load_policy(Path(job.policy), "auto", "auto")
+        config, policy = load_policy(job.policy, "auto", "auto")
     with closing(make_run_env(config)) as env:
         _watch(job, config, env, policy or _scripted(job.policy, env, job.seed))
 
@@ -43,7 +43,7 @@ def _check_run(folder: str) -> None:
         raise ConfigError(f"policy={folder}: expected expert, random or the folder of a run")
     for text in HydraConfig.get().overrides.task:
         if text.startswith("env"):
-            raise ConfigError(f"{text}: the environment is that of the run policy={folder}")
+            raise ConfigError(f"{text}: leave it out, policy={folder} is watched in its own task")
 
 
 def _scripted(name: str, env: ManipulationEnv, seed: int) -> TensorDictModuleBase:
@@ -71,7 +71,7 @@ def _watch(
     from equirl.training.video import open_film, record
 
     task = config.env.task
-    folder = Path(job.output or f"outputs/watch/{task}")
+    folder = Path(job.output or f"outputs/watch/{task}/{Path(job.policy).name}".replace(":", "."))
     film, sheet = folder / "film.mp4", folder / "sheet.png"
     shown = []
     env.set_seed(job.seed)

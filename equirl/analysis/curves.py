@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -42,7 +42,7 @@ def plot_run(folder: Path, path: Path) -> None:
     _save(figure, path)
 
 
-def plot_runs(groups: dict[str, Sequence[Path]], path: Path, *, title: str = "") -> None:
+def plot_runs(groups: Mapping[str, Sequence[Path]], path: Path, *, title: str = "") -> None:
     """Draws groups of runs over one another: greedy success and behaviour return.
 
     Args:
@@ -56,7 +56,8 @@ def plot_runs(groups: dict[str, Sequence[Path]], path: Path, *, title: str = "")
     for colour, (label, folders) in zip(cycle(_COLOURS), groups.items(), strict=False):
         _draw_success(left, folders, label, colour)
         _draw_return(right, folders, label, colour)
-    left.legend(frameon=False)
+    if left.get_legend_handles_labels()[0]:  # none without validations
+        left.legend(frameon=False)
     figure.suptitle(title)
     _save(figure, path)
 

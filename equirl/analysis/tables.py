@@ -42,7 +42,8 @@ def write_table(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
 def markdown_table(columns: Iterable[object], rows: Iterable[Iterable[object]]) -> str:
     """Returns a table in Markdown."""
     columns = list(columns)
-    return "\n".join(map(markdown_row, (columns, ["---"] * len(columns), *rows)))
+    lines: list[Iterable[object]] = [columns, ["---"] * len(columns), *rows]
+    return "\n".join(map(markdown_row, lines))
 
 
 def markdown_row(cells: Iterable[object]) -> str:

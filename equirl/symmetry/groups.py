@@ -15,6 +15,7 @@ from dataclasses import dataclass
 __all__ = ["Element", "SymmetryGroup"]
 
 _QUARTER = math.pi / 2
+_MOST_ROTATIONS = 1000  # a network has a field of this size for every feature
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ class SymmetryGroup:
 
     Args:
         name: ``"C<n>"`` (n rotations) or ``"D<n>"`` (n rotations and n reflections)
-            with n >= 2, in either case.
+            with n from 2 to 1000, in either case.
 
     Raises:
         ValueError: The name is not such a group.
@@ -78,10 +79,11 @@ class SymmetryGroup:
         if isinstance(name, SymmetryGroup):
             name = name.name
         match = re.fullmatch(r"([CD])(\d+)", str(name).strip().upper())
-        if match is None or int(match[2]) < 2:
+        if match is None or not 2 <= int(match[2]) <= _MOST_ROTATIONS:
             raise ValueError(
-                f"unknown symmetry group {name!r}: expected C<n> or D<n> with n >= 2, "
-                "for example C4, C8, D4 or D8 (the continuous SO2 and O2 are not available yet)"
+                f"unknown symmetry group {name!r}: expected C<n> or D<n> with n from 2 to "
+                f"{_MOST_ROTATIONS}, for example C4, C8, D4 or D8 (the continuous SO2 and O2 are "
+                "not available yet)"
             )
         self.rotations = int(match[2])
         self.reflections = match[1] == "D"

@@ -54,7 +54,7 @@ class Evaluation:
         low, high = self.interval
         return (
             f"{self.successes} of {len(self.episodes)} episodes succeed "
-            f"({self.success_rate:.0%}, 95 % confidence interval {low:.0%} to {high:.0%})"
+            f"({100 * self.success_rate:.3g}%, 95 % confidence interval {low:.0%} to {high:.0%})"
         )
 
 

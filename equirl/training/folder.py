@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
-from equirl.config import Config, flatten, load_config, save_config
+from equirl.config import Config, flatten, load_config
 from equirl.training.checkpoint import check_same_config
 
 __all__ = [
@@ -23,9 +23,10 @@ __all__ = [
     "TEST",
     "VIDEO",
     "FolderError",
+    "check_folder",
     "claim_folder",
+    "is_finished",
     "load_run_config",
-    "prepare_folder",
     "stop_on_interrupt",
 ]
 
@@ -50,14 +51,15 @@ class FolderError(RuntimeError):
     """A folder that a run cannot use; the message says why."""
 
 
-def prepare_folder(folder: Path, config: Config) -> None:
-    """Writes the configuration into the run's folder, unless it is there already.
+def check_folder(folder: Path, config: Config) -> None:
+    """Checks that a run may write into a folder.
 
     Raises:
         FolderError: The folder holds files of something else.
         CheckpointError: It holds the checkpoint of a run of another configuration.
     """
-    others = {path.name for path in folder.iterdir()} - {LOCK}
+    partial = {path.name for path in folder.glob("*.partial")}  # of writings cut short
+    others = {path.name for path in folder.iterdir()} - {LOCK} - partial
     if (folder / CHECKPOINT).exists() and (folder / CONFIG).exists():
         check_same_config(flatten(config), flatten(load_run_config(folder)), folder)
     elif others and CONFIG not in others:
@@ -65,7 +67,13 @@ def prepare_folder(folder: Path, config: Config) -> None:
             f"{folder} is not empty and not the folder of a run (it holds {sorted(others)[0]}); "
             "choose another"
         )
-    save_config(config, folder / CONFIG)
+
+
+def is_finished(folder: Path, config: Config) -> bool:
+    """Whether the folder holds the end of just this run."""
+    if not all((folder / name).exists() for name in (CONFIG, CHECKPOINT, TEST, REPORT)):
+        return False
+    return flatten(load_run_config(folder)) == flatten(config)
 
 
 def load_run_config(folder: Path) -> Config:
@@ -113,8 +121,11 @@ def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
 
     A second one interrupts at once, as usual. Outside the main thread, where signals
     cannot be handled, the answer is always no.
+
+    Raises:
+        KeyboardInterrupt: At the second one.
     """
-    asked = False
+    asked = insisted = False
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
@@ -124,12 +135,21 @@ def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
         asked = True
         print("\nstopping with a checkpoint; once more stops at once", file=sys.stderr, flush=True)
         for each in numbers:
-            signal.signal(each, signal.default_int_handler)
+            signal.signal(each, insist)
+
+    def insist(number: int, frame: FrameType | None) -> None:
+        nonlocal insisted
+        insisted = True
+        raise KeyboardInterrupt
 
     numbers = (signal.SIGINT, signal.SIGTERM)
     previous = {number: signal.signal(number, ask) for number in numbers}
     try:
         yield lambda: asked
+    except Exception as error:
+        if insisted:  # libraries turn the interrupt into errors of theirs
+            raise KeyboardInterrupt from error
+        raise
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)

@@ -109,7 +109,7 @@ def _average(actor: ProbabilisticActor, decay: float) -> AveragedModel:
 
 
 def load_policy(
-    folder: Path, device: str | None = None, backend: str | None = None
+    folder: str | Path, device: str | None = None, backend: str | None = None
 ) -> tuple[Config, ProbabilisticActor]:
     """The trained policy of a run's folder, with the run's configuration.
 
@@ -122,6 +122,7 @@ def load_policy(
         ConfigError: The folder is not that of a run, or the device or backend is not there.
         CheckpointError: It holds no readable checkpoint of that configuration.
     """
+    folder = Path(folder)
     config = load_run_config(folder)
     config = replace(config, device=device or config.device, backend=backend or config.backend)
     state = load_checkpoint(folder / CHECKPOINT)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable
 from functools import partial
@@ -11,7 +12,7 @@ from typing import Any
 import torch
 
 from equirl.collectors import DemonstrationCollector, Episode, OnlineCollector
-from equirl.config import Config, flatten
+from equirl.config import Config, ConfigError, flatten
 from equirl.data import load_replay_state, make_replay_buffer, replay_state
 from equirl.modules import shared_filters
 from equirl.training.checkpoint import (
@@ -31,6 +32,8 @@ from equirl.training.timing import Stopwatch
 
 __all__ = ["TrainingRun"]
 
+_log = logging.getLogger("equirl")
+
 #: What the run's time is divided into.
 PARTS = ("demonstrations", "act", "environment", "replay", "update", "evaluation", "checkpoint")
 
@@ -38,9 +41,9 @@ PARTS = ("demonstrations", "act", "environment", "replay", "update", "evaluation
 class TrainingRun:
     """One run of the paper's training (section 7 of its method, appendix D).
 
-    Construction builds everything from the configuration; `run` trains, going on
-    from the folder's checkpoint if there is one. A run stopped at any moment and
-    resumed is the run never stopped, bit for bit on one thread.
+    Construction builds everything from the configuration, `restore` brings it to where the
+    folder's checkpoint is, if there is one, `run` trains, `close` ends the simulations. A run
+    stopped at any moment and resumed is the run never stopped, bit for bit on one thread.
 
     Args:
         config: The run's configuration.
@@ -51,7 +54,10 @@ class TrainingRun:
     def __init__(
         self, config: Config, folder: Path, should_stop: Callable[[], bool] = lambda: False
     ):
-        torch.set_num_threads(config.threads or os.cpu_count() or 1)
+        processors = os.cpu_count() or 1
+        if config.threads > processors:
+            raise ConfigError(f"threads={config.threads}: this machine has {processors} processors")
+        torch.set_num_threads(config.threads or processors)
         seed_everything(config.seed)
         self.config, self.folder, self.should_stop = config, folder, should_stop
         self.learner = Learner(config)
@@ -79,23 +85,29 @@ class TrainingRun:
         self.averages = Averages(self.learner.metric_names)
         self.progress = Progress(config.logging.progress)
 
+    def restore(self) -> None:
+        """Goes on where the folder's checkpoint is, if there is one.
+
+        Raises:
+            CheckpointError: It is of another configuration, or of a step beyond the last one.
+        """
+        path = self.folder / CHECKPOINT
+        if path.exists():
+            self._restore(load_checkpoint(path), path)
+            _log.info("goes on after step %d", self.step)
+        self.log.rewind(self.step)
+
     def run(self) -> Evaluation | None:
         """Trains to the configured number of steps, then evaluates on the test scenes.
 
         Returns:
             The evaluation, or None when ``should_stop`` ended the run early.
         """
-        try:
-            if (self.folder / CHECKPOINT).exists():
-                self._restore(load_checkpoint(self.folder / CHECKPOINT))
-            else:
-                self.log.rewind(-1)
-                self._collect_demonstrations()
-            if not self._train():
-                return None
-            return self._evaluate(Purpose.TEST, self.config.evaluation.final_episodes)
-        finally:
-            self.close()
+        if self.step == 0 and not self._collect_demonstrations():
+            return None
+        if not self._train():
+            return None
+        return self._evaluate(Purpose.TEST, self.config.evaluation.final_episodes)
 
     def close(self) -> None:
         """Ends the trackers and the simulations."""
@@ -104,9 +116,10 @@ class TrainingRun:
             if not env.is_closed:
                 env.close()
 
-    def _collect_demonstrations(self) -> None:
+    def _collect_demonstrations(self) -> bool:
+        """Fills the buffer; False when it was told to stop."""
         if self.config.demos.episodes == 0:
-            return
+            return True
         demonstrations = DemonstrationCollector(
             self.env,
             make_run_expert(self.config, self.env),
@@ -116,7 +129,9 @@ class TrainingRun:
         )
         with self.clock.measure("demonstrations"):
             for _ in demonstrations:
-                pass
+                if self.should_stop():
+                    return False
+        return True
 
     def _train(self) -> bool:
         """The loop of the paper; True when it reached the last step."""
@@ -215,20 +230,18 @@ class TrainingRun:
             self.folder / CHECKPOINT,
         )
 
-    def _restore(self, state: dict[str, Any]) -> None:
-        check_same_config(flatten(self.config), state["config"], self.folder / CHECKPOINT)
-        self.step = state["step"]
-        if self.step > self.config.steps:
-            where = self.folder / CHECKPOINT
+    def _restore(self, state: dict[str, Any], path: Path) -> None:
+        check_same_config(flatten(self.config), state["config"], path)
+        if state["step"] > self.config.steps:
             raise CheckpointError(
-                f"{where} is at step {self.step}, beyond steps={self.config.steps}"
+                f"{path} is at step {state['step']}, beyond steps={self.config.steps}"
             )
+        self.step = state["step"]
         self.learner.load_state_dict(state["learner"])
         load_replay_state(self.buffer, state["buffer"])
         self.collector.load_state_dict(state["collector"])
         self.averages.load_state_dict(state["averages"])
         self.clock.load_state_dict(state["clock"])
-        self.log.rewind(self.step)
         # Last, since rebuilding the rest may draw random numbers.
         self.generator.set_state(state["replay_rng"])
         torch.set_rng_state(state["policy_rng"])

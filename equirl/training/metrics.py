@@ -33,7 +33,7 @@ class MetricsLog:
         self.trackers = _trackers(folder, config)
 
     def rewind(self, step: int) -> None:
-        """Drops the rows after ``step``, which a resumed run will write again."""
+        """Drops the rows after ``step``, which a resumed run will write again; all at step 0."""
         for table in self.TABLES:
             path = self.folder / f"{table}.csv"
             if not path.exists():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -31,7 +32,8 @@ class Progress:
     @contextmanager
     def bar(self, **options: Any) -> Iterator[tqdm]:
         """A bar to ``update``; ``options`` are those of tqdm."""
-        with tqdm(dynamic_ncols=True, disable=not self.visible, **options) as bar:
+        pace = 0.1 if sys.stderr.isatty() else 30.0  # seconds between two looks of it
+        with tqdm(dynamic_ncols=True, disable=not self.visible, mininterval=pace, **options) as bar:
             yield bar
 
     def note(self, episode: Episode) -> None:

@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import csv
-from contextlib import closing
+import logging
+import re
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 
-from equirl.config import Config
+from equirl.analysis.tables import write_table
+from equirl.collectors import Episode
+from equirl.config import Config, ConfigError, save_config
 from equirl.training.environment import make_run_env
 from equirl.training.evaluation import Evaluation
 from equirl.training.folder import (
+    CONFIG,
     CURVES,
     REPORT,
     TEST,
     VIDEO,
+    check_folder,
     claim_folder,
-    prepare_folder,
+    is_finished,
     stop_on_interrupt,
 )
 from equirl.training.loop import TrainingRun
@@ -23,10 +30,12 @@ from equirl.training.report import write_report
 from equirl.training.seeding import Purpose, scene_seed
 from equirl.training.video import film_policy
 
-__all__ = ["train", "write_episodes"]
+__all__ = ["read_evaluation", "train", "write_evaluation"]
+
+_log = logging.getLogger("equirl")
 
 
-def train(config: Config, folder: Path) -> Evaluation | None:
+def train(config: Config, folder: str | Path) -> Evaluation | None:
     """Trains in a folder, or goes on with the run it holds, and reports there.
 
     Args:
@@ -35,30 +44,54 @@ def train(config: Config, folder: Path) -> Evaluation | None:
 
     Returns:
         The trained policy's success on the test scenes, or None when Ctrl-C stopped the
-        run; calling again then goes on where it stopped.
+        run; calling again then goes on where it stopped. A run that is finished already is
+        left alone.
 
     Raises:
-        ConfigError: A device or a tracker that this machine does not have.
+        ConfigError: A device, a tracker, or the memory that this machine does not have.
         FolderError: The folder cannot be written, holds something else, or another run
             is using it.
         CheckpointError: The folder holds a run of another configuration, or a
             checkpoint cannot be written or read.
         DemonstrationError: The expert does not solve the task as configured.
+        KeyboardInterrupt: At the second Ctrl-C; what the checkpoint holds is safe.
     """
-    with claim_folder(folder):
-        prepare_folder(folder, config)
-        with stop_on_interrupt() as should_stop:
-            run = TrainingRun(config, folder, should_stop)
+    folder = Path(folder)
+    with claim_folder(folder), stop_on_interrupt() as should_stop, _memory_told():
+        check_folder(folder, config)
+        if is_finished(folder, config):
+            _log.info("this run is finished already")
+            return read_evaluation(folder / TEST)
+        with closing(TrainingRun(config, folder, should_stop)) as run:
+            run.restore()
+            save_config(config, folder / CONFIG)  # only now: it fits what is there
             for name in (TEST, REPORT, CURVES, VIDEO):  # of an earlier end: of another policy
                 (folder / name).unlink(missing_ok=True)
             evaluation = run.run()
-        if evaluation is None:
-            return None
-        write_episodes(evaluation, folder / TEST)
-        write_report(folder, config, evaluation)
-        if config.evaluation.video_episodes and _film(run, folder / VIDEO):
-            write_report(folder, config, evaluation, video=folder / VIDEO)
+            if evaluation is None:
+                return None
+            write_evaluation(evaluation, folder / TEST)
+            filmed = config.evaluation.video_episodes > 0 and _film(run, folder / VIDEO)
+            write_report(folder, config, evaluation, video=folder / VIDEO if filmed else None)
     return evaluation
+
+
+@contextmanager
+def _memory_told() -> Iterator[None]:
+    """Turns torch's errors about memory into a sentence."""
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        text = str(error)
+        asked = re.search(r"allocate (\d+) bytes", text)
+        if not (asked or "out of memory" in text or "multiplication overflow" in text):
+            raise
+        amount = f" (it asked for {int(asked[1]) / 1e9:,.1f} GB at once)" if asked else ""
+        raise ConfigError(
+            f"this machine's memory does not hold such a run{amount}; smaller ones have less of "
+            "method.hidden, method.head_width, env.image_size, algorithm.batch_size, "
+            "replay.capacity, augmentation.copies, or a smaller group"
+        ) from error
 
 
 def _film(run: TrainingRun, path: Path) -> bool:
@@ -78,11 +111,34 @@ def _film(run: TrainingRun, path: Path) -> bool:
     return True
 
 
-def write_episodes(evaluation: Evaluation, path: Path) -> None:
+def write_evaluation(evaluation: Evaluation, path: Path) -> None:
     """Writes one row an episode of an evaluation."""
-    with open(path, "w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(("seed", "success", "length", "discounted_return"))
-        for seed, episode in zip(evaluation.seeds, evaluation.episodes, strict=True):
-            row = (seed, int(episode.success), episode.length, episode.discounted_return)
-            writer.writerow(row)
+    rows = [
+        {
+            "seed": seed,
+            "success": int(episode.success),
+            "length": episode.length,
+            "return": episode.undiscounted_return,
+            "discounted_return": episode.discounted_return,
+        }
+        for seed, episode in zip(evaluation.seeds, evaluation.episodes, strict=True)
+    ]
+    write_table(path, rows)
+
+
+def read_evaluation(path: Path) -> Evaluation:
+    """Reads what `write_evaluation` wrote."""
+    with open(path, newline="") as file:
+        rows = list(csv.DictReader(file))
+    return Evaluation(
+        seeds=tuple(int(row["seed"]) for row in rows),
+        episodes=tuple(
+            Episode(
+                length=int(row["length"]),
+                success=row["success"] == "1",
+                undiscounted_return=float(row["return"]),
+                discounted_return=float(row["discounted_return"]),
+            )
+            for row in rows
+        ),
+    )

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from equirl.analysis import moving_return, read_table, wilson_interval
+from equirl.analysis import moving_return, wilson_interval
 
 
 def test_wilson_interval_equals_the_closed_form():
@@ -29,10 +29,3 @@ def test_moving_return_averages_the_window_only():
     steps, returns = np.array([100, 300, 500, 700, 1200]), np.array([0.0, 1.0, 0.5, 1.0, 0.0])
     expected = [0, 0.5, 0.5, (1 + 0.5 + 1) / 3, 0.0]
     np.testing.assert_allclose(moving_return(steps, returns, window=500), expected)
-
-
-def test_read_table_leaves_out_a_line_cut_short(tmp_path):
-    path = tmp_path / "metrics.csv"
-    path.write_text("step,value\n1,0.5\n2,0.25\n3,0.")
-    assert read_table(path) == {"step": [1, 2], "value": [0.5, 0.25]}
-    assert read_table(tmp_path / "missing.csv") == {}

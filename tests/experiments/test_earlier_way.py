@@ -1,23 +1,16 @@
 """The model that speed is measured against does the work it stands for."""
 
-import importlib.util
-from pathlib import Path
-
+import earlier_way
 import numpy as np
 import pytest
 
 from equirl.envs import make_env, make_expert
+from equirl.envs.tasks import TASKS
 
-PATH = Path(__file__).parents[2] / "experiments" / "earlier_way.py"
-SPEC = importlib.util.spec_from_file_location("earlier_way", PATH)
-earlier_way = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(earlier_way)
 SIZE = 32
 
 
-@pytest.mark.parametrize(
-    "task", ["block_picking", "block_pushing", "block_in_bowl", "clutter_grasping"]
-)
+@pytest.mark.parametrize("task", TASKS)
 def test_an_episode_of_ours_played_the_earlier_way(task):
     env = make_env(task, image_size=SIZE)
     expert, state = make_expert(env), env.reset()

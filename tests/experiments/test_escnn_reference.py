@@ -1,37 +1,21 @@
 """The comparison with escnn is fair: same weights, same numbers, same update."""
 
 import copy
-import importlib.util
-from pathlib import Path
 
+import escnn_reference as reference
 import pytest
 import torch
-from tensordict import TensorDict
 from torchrl.objectives import SoftUpdate
 
 from equirl.modules import make_actor, make_critic
 from equirl.objectives import SACLoss
+from tests.transitions import transitions
 
-PATH = Path(__file__).parents[2] / "experiments" / "escnn_reference.py"
-SPEC = importlib.util.spec_from_file_location("escnn_reference", PATH)
-reference = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(reference)
-BATCH, IMAGE = 8, 32
+IMAGE = 32
 
 
-def batch() -> TensorDict:
-    torch.manual_seed(0)
-
-    def observation() -> dict[str, torch.Tensor]:
-        return {
-            "depth": 0.3 * torch.rand(BATCH, 1, IMAGE, IMAGE),
-            "holding": torch.rand(BATCH, 1).round(),
-        }
-
-    done = torch.arange(BATCH).unsqueeze(-1) < 2
-    following = observation() | {"reward": torch.rand(BATCH, 1), "done": done, "terminated": done}
-    action = 0.7 * (2 * torch.rand(BATCH, 5) - 1)
-    return TensorDict(observation() | {"action": action, "next": following}, [BATCH])
+def batch():
+    return transitions(8, IMAGE)
 
 
 def networks(group: str, backend: str):

@@ -1,10 +1,7 @@
 """Actors and critics: parameter counts of the paper, keys, shapes, reproducibility, errors."""
 
 import copy
-import os
 import pickle
-import subprocess
-import sys
 
 import pytest
 import torch
@@ -24,6 +21,7 @@ from equirl.modules import (
     shared_filters,
 )
 from equirl.symmetry import ACTION, ACTION_PAPER
+from tests.equivariance import assert_equivariant, turn_action, turn_image
 
 SMALL = {"hidden": 8, "image_size": 16}
 slow = pytest.mark.slow
@@ -153,12 +151,9 @@ def test_every_parameter_receives_a_gradient(networks):
     with shared_filters(), set_exploration_type(ExplorationType.RANDOM):
         data = critic(actor(observations(16)))
         (data["state_action_value"].sum() + data["action_log_prob"].sum()).backward()
-    for parameter in (*actor.parameters(), *critic.parameters()):
-        assert parameter.grad is not None
-        assert torch.isfinite(parameter.grad).all()
-    assert sum(p.grad.abs().sum() > 0 for p in critic.parameters()) >= 0.8 * len(
-        [*critic.parameters()]
-    )
+    for name, parameter in (*actor.named_parameters(), *critic.named_parameters()):
+        assert torch.isfinite(parameter.grad).all(), name
+        assert parameter.grad.any(), name
 
 
 def test_state_dict_is_parameters_only_in_either_mode(networks):
@@ -254,7 +249,7 @@ def test_every_image_size(size, cnn):
         ({"hidden": 8, "image_size": 256}, "hidden=8 .* multiple of 16"),
         ({"hidden": 0}, "hidden=0"),
         ({"hidden": 8.0}, "hidden=8.0"),
-        ({"mode": "exact"}, "'exact'.*'strict' or 'paper'"),
+        ({"mode": "exact"}, "mode='exact': expected one of strict, paper"),
     ],
 )
 def test_bad_arguments_are_refused(make, kwargs, message):
@@ -277,30 +272,18 @@ def test_wrong_observation_shapes_are_refused():
         actor.module[0].module(torch.rand(2, 1, 16, 16), torch.ones(3, 1))
 
 
-def test_import_needs_no_simulator():
-    code = (
-        "import sys; sys.modules['pybullet'] = None\n"
-        "import equirl.modules\n"
-        "assert not any(name.startswith('equirl.envs') for name in sys.modules)"
-    )
-    environment = os.environ | {"RL_LOGGING_LEVEL": "ERROR"}
-    subprocess.run([sys.executable, "-c", code], check=True, env=environment)
-
-
 def test_wider_heads_leave_the_encoder_alone_and_values_invariant():
     generator = torch.Generator().manual_seed(0)
-    critic = make_critic("D4", hidden=8, image_size=16, head_width=24, generator=generator)
-    assert count(critic[0]) == count(make_critic("D4", hidden=8, image_size=16)[0])
+    critic = make_critic("D4", **SMALL, head_width=24, generator=generator)
+    assert count(critic[0]) == count(make_critic("D4", **SMALL)[0])
     assert critic[1].module.hidden.out_type.size == 2 * 24 * 8
-    critic = critic.double()
-    depth = torch.rand(3, 1, 16, 16, dtype=torch.float64, generator=generator)
-    action = torch.rand(3, 5, dtype=torch.float64, generator=generator) - 0.5
-    data = TensorDict({"depth": depth, "holding": torch.zeros(3, 1).double(), "action": action}, 3)
-    turned = data.clone()
-    turned["depth"] = depth.rot90(1, (-2, -1)).flip(-1)
-    # A quarter turn (x, y) -> (-y, x), then y -> -y, which reverses theta.
-    turned["action"] = action[:, [0, 2, 1, 3, 4]] * torch.tensor([1, -1, -1, 1, -1])
-    values = [critic(x)["state_action_value"] for x in (data, turned)]
-    torch.testing.assert_close(values[0], values[1], atol=1e-9, rtol=0)
+    critic.double()
+    assert_equivariant(
+        lambda **inputs: {"values": critic(TensorDict(inputs, 3))["state_action_value"]},
+        "D4",
+        {**observations(3).double(), "action": torch.rand(3, 5).double()},
+        {"depth": turn_image, "action": turn_action},
+        case="wide critic",
+    )
     with pytest.raises(ValueError, match="head_width=0"):
-        make_critic("D4", hidden=8, image_size=16, head_width=0)
+        make_critic("D4", **SMALL, head_width=0)

@@ -1,12 +1,7 @@
-"""Turn the scene and the policy turns with it, to rounding, for every grid element.
-
-The transformations are written out here with rot90, flip and matrices, so that an error
-in the package's own idea of a rotation cannot hide.
-"""
+"""Turn the scene and the policy turns with it, to rounding, for every grid element."""
 
 import math
 
-import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -20,42 +15,19 @@ from equirl.modules import (
     make_critic,
 )
 from equirl.symmetry import ACTION, Element, SymmetryGroup
+from tests.equivariance import (
+    assert_equivariant,
+    turn_action,
+    turn_action_of_the_paper,
+    turn_fields,
+    turn_image,
+)
 
-TOLERANCE = 1e-9
 slow = pytest.mark.slow
 GROUPS = ("C4", "D4", "C8", "D8", "C2", "D2", *(pytest.param(g, marks=slow) for g in ("C6", "D3")))
 SIZES = (16, pytest.param(32, marks=slow), pytest.param(64, marks=slow))
 SIZES += (pytest.param(128, marks=slow), pytest.param(256, marks=slow))
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """These tensors are small: threads that wait for each other cost more."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
-def grid_elements(group):
-    """(quarter turns, reflected) for every element that maps the pixels onto themselves."""
-    order = int(group[1:])
-    turns = [k for k in range(4) if k * order % 4 == 0]
-    return [(k, flip) for flip in ((False, True) if group[0] == "D" else (False,)) for k in turns]
-
-
-def turn_image(image, turns, flip):
-    return torch.rot90(image.flip(-1) if flip else image, turns, (-2, -1))
-
-
-def turn_action(action, turns, flip, theta_is_invariant=False):
-    """(gripper, x, y, z, theta): y -> -y and theta -> -theta, then x towards y."""
-    c, s = [(1, 0), (0, 1), (-1, 0), (0, -1)][turns]
-    vector = np.array([[c, -s], [s, c]]) @ np.diag([1, -1 if flip else 1])
-    matrix = np.eye(5)
-    matrix[1:3, 1:3] = vector
-    matrix[4, 4] = -1 if flip and not theta_is_invariant else 1
-    return action @ torch.tensor(matrix.T)
+SCENES = ("random", "cube under the gripper", "nothing")
 
 
 def scenes(kind, size):
@@ -93,58 +65,72 @@ def make(function, group, scene, size=16, **kwargs):
     )
 
 
-def close(actual, expected):
-    torch.testing.assert_close(actual, expected, atol=TOLERANCE, rtol=0)
-
-
-SCENES = ("random", "cube under the gripper", "nothing")
+def actions(scale=1.0):
+    generator = torch.Generator().manual_seed(5)
+    return scale * (2 * torch.rand(3, 5, generator=generator, dtype=torch.float64) - 1)
 
 
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("group", GROUPS)
 def test_strict_actor(group, scene, size):
-    actor, data = make(make_actor, group, scene, size), scenes(scene, size)
-    before = actor.get_dist(data.clone())
-    generator = torch.Generator().manual_seed(5)
-    action = 0.57 * (2 * torch.rand(3, 5, generator=generator, dtype=torch.float64) - 1)
-    for g in grid_elements(group):
-        turned = data.clone().set("depth", turn_image(data["depth"], *g))
-        after = actor.get_dist(turned)
-        close(after.loc, turn_action(before.loc, *g))
-        close(after.scale, before.scale)
-        close(after.deterministic_sample, turn_action(before.deterministic_sample, *g))
-        close(after.log_prob(turn_action(action, *g)), before.log_prob(action))
+    actor = make(make_actor, group, scene, size)
+
+    def policy(depth, holding, action):
+        dist = actor.get_dist(TensorDict(depth=depth, holding=holding, batch_size=3))
+        return {
+            "loc": dist.loc,
+            "scale": dist.scale,
+            "greedy": dist.deterministic_sample,
+            "log_prob": dist.log_prob(action),
+        }
+
+    assert_equivariant(
+        policy,
+        group,
+        {**scenes(scene, size), "action": actions(0.57)},  # (x, y) inside the disc
+        {"depth": turn_image, **dict.fromkeys(("action", "loc", "greedy"), turn_action)},
+        case=f"strict actor, {scene}",
+    )
 
 
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("group", GROUPS)
 def test_strict_critic(group, scene, size):
-    critic, data = make(make_critic, group, scene, size), scenes(scene, size)
-    generator = torch.Generator().manual_seed(5)
-    data["action"] = 2 * torch.rand(3, 5, generator=generator, dtype=torch.float64) - 1
-    before = critic(data.clone())["state_action_value"]
-    assert before.shape == (3, 2)
-    for g in grid_elements(group):
-        turned = data.clone().set("depth", turn_image(data["depth"], *g))
-        turned["action"] = turn_action(data["action"], *g)
-        close(critic(turned)["state_action_value"], before)
+    critic = make(make_critic, group, scene, size)
+
+    def values(**inputs):
+        values = critic(TensorDict(inputs, 3))["state_action_value"]
+        assert values.shape == (3, 2)
+        return {"values": values}
+
+    assert_equivariant(
+        values,
+        group,
+        {**scenes(scene, size), "action": actions()},
+        {"depth": turn_image, "action": turn_action},
+        case=f"strict critic, {scene}",
+    )
 
 
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("group", GROUPS)
 def test_paper_networks_under_their_declared_representation(group, scene):
-    actor, data = make(make_actor, group, scene, mode="paper"), scenes(scene, 16)
-    critic = make(make_critic, group, scene, mode="paper")
-    before = critic(actor(data.clone()))
-    for g in grid_elements(group):
-        turned = data.clone().set("depth", turn_image(data["depth"], *g))
-        after = actor(turned)
-        close(after["loc"], turn_action(before["loc"], *g, theta_is_invariant=True))
-        close(after["scale"], before["scale"])
-        after["action"] = turn_action(before["action"], *g, theta_is_invariant=True)
-        close(critic(after)["state_action_value"], before["state_action_value"])
+    actor, critic = (make(each, group, scene, mode="paper") for each in (make_actor, make_critic))
+
+    def both(depth, holding, action):
+        data = actor(TensorDict(depth=depth, holding=holding, batch_size=3))
+        values = critic(data.clone().set("action", action))["state_action_value"]
+        return {**data.select("loc", "scale"), "values": values}
+
+    assert_equivariant(
+        both,
+        group,
+        {**scenes(scene, 16), "action": actions()},
+        {"depth": turn_image, **dict.fromkeys(("action", "loc"), turn_action_of_the_paper)},
+        case=f"paper networks, {scene}",
+    )
 
 
 def test_what_the_paper_mode_gets_wrong_physically():
@@ -154,8 +140,8 @@ def test_what_the_paper_mode_gets_wrong_physically():
     before = actor(data.clone())
     mirrored = data.clone().set("depth", turn_image(data["depth"], 0, True))
     error = actor(mirrored)["loc"] - turn_action(before["loc"], 0, True)
-    close(error[:, :4], torch.zeros(3, 4, dtype=torch.float64))
-    close(error[:, 4], 2 * before["loc"][:, 4])
+    assert error[:, :4].abs().max() < 1e-9
+    torch.testing.assert_close(error[:, 4], 2 * before["loc"][:, 4], atol=1e-9, rtol=0)
     assert error[:, 4].abs().min() > 1e-4
     action = torch.full((3, 5), 0.5, dtype=torch.float64)
     values = critic(data.clone().set("action", action))["state_action_value"]
@@ -171,12 +157,14 @@ def test_what_the_paper_mode_gets_wrong_physically():
 @pytest.mark.parametrize("group", GROUPS)
 @pytest.mark.parametrize("scene", SCENES)
 def test_encoder_permutes_its_regular_fields(group, scene):
-    encoder, data = make(EquivariantEncoder, group, scene), scenes(scene, 16)
-    before = encoder(data["depth"], data["holding"])
-    for turns, flip in grid_elements(group):
-        after = encoder(turn_image(data["depth"], turns, flip), data["holding"])
-        expected = encoder.out_type.transform(before, Element(turns * math.pi / 2, flip))
-        close(after, expected)
+    encoder = make(EquivariantEncoder, group, scene)
+    assert_equivariant(
+        lambda **inputs: {"features": encoder(**inputs)},
+        group,
+        dict(scenes(scene, 16)),
+        {"depth": turn_image, "features": turn_fields(encoder.out_type)},
+        case=f"encoder, {scene}",
+    )
 
 
 @pytest.mark.parametrize("group", GROUPS)
@@ -188,21 +176,27 @@ def test_convolution_of_mixed_fields(group):
     layer.bias.data.normal_(generator=generator)
     x = torch.randn(2, fields.size, 6, 6, dtype=torch.float64, generator=generator)
 
-    def turn(x, turns, flip):
-        element = Element(turns * math.pi / 2, flip)
-        return turn_image(fields.transform(x.movedim(1, -1), element).movedim(-1, 1), turns, flip)
+    def turn(x, *element):
+        channels = turn_fields(fields)(x.movedim(1, -1), *element).movedim(-1, 1)
+        return turn_image(channels, *element)
 
-    for g in grid_elements(group):
-        close(layer(turn(x, *g)), turn(layer(x), *g))
+    assert_equivariant(
+        lambda x: {"y": layer(x)}, group, {"x": x}, {"x": turn, "y": turn}, case="convolution"
+    )
 
 
 def test_the_test_would_notice():
-    """The baseline has no symmetry: the same measurement finds a large error."""
+    """The baseline has no symmetry: the same assertion fails, and says where."""
     actor = prepared(make_cnn_actor(hidden=8, image_size=16), "random")
-    data = scenes("random", 16)
-    before = actor(data.clone())["loc"]
-    turned = data.clone().set("depth", turn_image(data["depth"], 1, False))
-    assert (actor(turned)["loc"] - turn_action(before, 1, False)).abs().max() > 1e-4
+    with pytest.raises(AssertionError, match=r"CNN: loc under 90° errs by [\d.]+, more"):
+        assert_equivariant(
+            lambda **inputs: dict(actor(TensorDict(inputs, 3)).select("loc")),
+            "C4",
+            dict(scenes("random", 16)),
+            {"depth": turn_image, "loc": turn_action},
+            case="CNN",
+            tolerance=1e-4,
+        )
 
 
 @pytest.mark.parametrize("group", ["C8", "D8"])

@@ -1,27 +1,23 @@
 """The example with Stable-Baselines3, end to end."""
 
-import importlib.util
 import sys
-from pathlib import Path
 
 import pytest
 import torch
 
-SCRIPT = Path(__file__).parents[2] / "experiments" / "stable_baselines3_sac.py"
 SMALL = ["--image-size", "16", "--robot", "hand", "--episodes", "1"]
 
 
-def load():
-    specification = importlib.util.spec_from_file_location(SCRIPT.stem, SCRIPT)
-    module = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(module)
-    return module
+@pytest.fixture
+def main():
+    pytest.importorskip("stable_baselines3")
+    from stable_baselines3_sac import main
+
+    return main
 
 
 @pytest.mark.parametrize("demos", [0, 1])
-def test_the_agent_trains_for_as_long_as_asked(demos, capsys):
-    pytest.importorskip("stable_baselines3")
-    main = load().main
+def test_the_agent_trains_for_as_long_as_asked(main, demos, capsys):
     untrained = main([*SMALL, "--steps", "0", "--demos", str(demos)])
     trained = main([*SMALL, "--steps", "60", "--demos", str(demos)])
     assert (untrained.num_timesteps, trained.num_timesteps) == (0, 60)
@@ -48,6 +44,24 @@ def test_stable_baselines3_wants_bytes_in_images_and_nothing_else():
 
 
 def test_without_the_extra_it_says_what_to_install(monkeypatch):
+    monkeypatch.delitem(sys.modules, "stable_baselines3_sac", raising=False)
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)
     with pytest.raises(SystemExit, match=r"needs: pip install 'equirl\[sb3\]'"):
-        load()
+        import stable_baselines3_sac  # noqa: F401
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["--steps", "-1"], "argument --steps: expected an integer of 0 or more, got '-1'"),
+        (["--demos", "some"], "argument --demos: expected an integer of 0 or more, got 'some'"),
+        (["--episodes", "0"], "argument --episodes: expected an integer of 1 or more, got '0'"),
+        (["--image-size", "7"], "image_size must be an even positive integer, got 7"),
+        (["--env", "equirl/BlockStacking-v0"], "invalid choice: 'equirl/BlockStacking-v0'"),
+        (["--robot", "arm"], "invalid choice: 'arm'"),
+    ],
+)
+def test_bad_arguments_are_named(main, capsys, arguments, named):
+    with pytest.raises(SystemExit) as stopped:
+        main([*SMALL, *arguments])
+    assert stopped.value.code == 2 and named in capsys.readouterr().err

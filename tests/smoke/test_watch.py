@@ -1,6 +1,5 @@
 """Looking at tasks, policies and objects, as a user calls it."""
 
-import importlib.util
 import re
 import subprocess
 import sys
@@ -9,33 +8,23 @@ from pathlib import Path
 import imageio.v2 as imageio
 import imageio_ffmpeg
 import numpy as np
+import object_sheet
 import pytest
+import watch as watch_script
 
 from equirl.config import to_config
 
-ROOT = Path(__file__).parents[2]
 SMALL = ["env.image_size=16", "env.robot=hand", "size=32"]
-
-
-def load(script: str):
-    specification = importlib.util.spec_from_file_location(
-        script, ROOT / f"experiments/{script}.py"
-    )
-    module = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture
 def watch(monkeypatch, capsys):
     """Calls the entry point in this process; returns what it prints, or its complaint."""
-    monkeypatch.setenv("HYDRA_MAIN_MODULE", "__main__")  # configuration beside the script's file
-    main = load("watch").main
 
     def call(*arguments: str) -> str:
         monkeypatch.setattr(sys, "argv", ["watch.py", *SMALL, *arguments])
         try:
-            main()
+            watch_script.main()
         except SystemExit as exit:
             assert exit.code != 0
             return f"{exit.code}\n{capsys.readouterr().err}"
@@ -97,7 +86,7 @@ def test_the_policy_of_a_run_in_its_own_environment(watch, tmp_path, monkeypatch
     }
     train(to_config(values), tmp_path / "run")
     policy = f"policy={tmp_path / 'run'}"
-    assert "env.image_size=16: the environment is that of the run" in watch(policy)
+    assert "env.image_size=16: leave it out" in watch(policy)
     monkeypatch.setattr(sys.modules[__name__], "SMALL", ["size=32"])
     output = tmp_path / "watched"
     printed = watch(policy, "episodes=1", f"output={output}")
@@ -115,7 +104,7 @@ def test_the_policy_of_a_run_in_its_own_environment(watch, tmp_path, monkeypatch
         (["env.max_steps=0"], "env.max_steps=0: expected 1 or more"),
         (["env.image_size=7"], "env.image_size=7: expected an even number"),
         (["episodes=0"], "episodes=0: expected 1 or more"),
-        (["size=33"], "size=33: expected an even number"),
+        (["size=33"], "size=33: expected 2 or more, even"),
         (["fps=slow"], "slow"),
         (["output=/proc/none"], "cannot write output=/proc/none"),
     ],
@@ -132,7 +121,7 @@ def test_a_folder_without_a_run_is_no_policy(watch, tmp_path, monkeypatch):
 
 def test_every_household_object_is_drawn(tmp_path, capsys):
     sheet = tmp_path / "objects.png"
-    load("object_sheet").main(["--output", str(sheet), "--size", "24", "--columns", "38"])
+    object_sheet.main(["--output", str(sheet), "--size", "24", "--columns", "38"])
     assert f"76 objects: {sheet}" in capsys.readouterr().out
     picture = imageio.imread(sheet)[..., :3]
     assert picture.shape[1] > 38 * 24 and picture.std() > 10
@@ -144,7 +133,7 @@ def test_a_sheet_of_ones_own_meshes(tmp_path, capsys, monkeypatch):
     (tmp_path / "meshes").mkdir()
     trimesh.creation.box((2, 3, 4)).export(tmp_path / "meshes" / "brick.obj")
     sheet = tmp_path / "own.png"
-    main = load("object_sheet").main
+    main = object_sheet.main
     main(["--meshes", str(tmp_path / "meshes"), "--output", str(sheet)])
     assert "1 objects" in capsys.readouterr().out
     assert imageio.imread(sheet).std() > 10

@@ -1,27 +1,19 @@
 """One gradient step, and the policy that is kept."""
 
+from contextlib import closing
+
 import pytest
 import torch
 from tensordict import TensorDict
 
+from equirl.config import save_config
 from equirl.training import TrainingRun, load_policy, train
-from equirl.training.folder import prepare_folder
 from equirl.training.learner import Learner
+from tests.transitions import transitions
 
 
-def batch(count: int = 4, size: int = 16) -> TensorDict:
-    generator = torch.Generator().manual_seed(0)
-
-    def observation():
-        depth = 0.3 * torch.rand(count, 1, size, size, generator=generator)
-        return {"depth": depth, "holding": torch.zeros(count, 1)}
-
-    flag = torch.zeros(count, 1, dtype=torch.bool)
-    following = {"reward": torch.ones(count, 1), "done": flag, "terminated": flag}
-    action = torch.rand(count, 5, generator=generator) - 0.5
-    return TensorDict(
-        observation() | {"action": action, "next": observation() | following}, [count]
-    )
+def batch() -> TensorDict:
+    return transitions(4, 16)
 
 
 def values(module) -> list[torch.Tensor]:
@@ -52,18 +44,19 @@ def test_every_trained_parameter_moves(small_config):
 def test_average_is_a_plain_mean_at_first_and_exponential_later(small_config):
     learner = Learner(small_config(algorithm={"averaging": 0.75}))
     history = []
-    expected = None
-    for count in range(8):
+    for _ in range(4):  # as many as weigh a quarter each
         learner.update(batch())
         history.append(values(learner.actor))
-        share = max(0.25, 1 / (count + 1))
-        expected = (
-            history[0]
-            if expected is None
-            else [old.lerp(new, share) for old, new in zip(expected, history[-1], strict=True)]
-        )
-    for ours, plain in zip(values(learner.policy), expected, strict=True):
-        torch.testing.assert_close(ours, plain)
+    means = [torch.stack(parameters).mean(0) for parameters in zip(*history, strict=True)]
+    for ours, mean in zip(values(learner.policy), means, strict=True):
+        torch.testing.assert_close(ours, mean)
+    for _ in range(3):
+        before = values(learner.policy)
+        learner.update(batch())
+        history.append(values(learner.actor))
+        triples = zip(values(learner.policy), before, history[-1], strict=True)
+        for ours, old, new in triples:
+            torch.testing.assert_close(ours, 0.75 * old + 0.25 * new)
     assert learner.policy is not learner.actor
     assert any((a != b).any() for a, b in zip(values(learner.policy), history[-1], strict=True))
 
@@ -76,11 +69,10 @@ def test_without_averaging_the_actor_itself_is_kept(small_config):
 @pytest.mark.parametrize("averaging", [0.0, 0.9])
 def test_a_loaded_policy_acts_as_the_trained_one(tmp_path, small_config, averaging):
     config = small_config(steps=6, algorithm={"averaging": averaging})
-    tmp_path.joinpath("run").mkdir()
-    prepare_folder(tmp_path / "run", config)
-    training = TrainingRun(config, tmp_path / "run")
-    training.run()
-    _, policy = load_policy(tmp_path / "run")
+    save_config(config, tmp_path / "config.yaml")
+    with closing(TrainingRun(config, tmp_path)) as training:
+        training.run()
+    _, policy = load_policy(str(tmp_path))
     data = batch()
     with torch.no_grad():
         expected = training.learner.policy(data.select("depth", "holding"))

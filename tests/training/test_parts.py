@@ -176,9 +176,9 @@ def test_an_expert_that_cannot_succeed_is_named(tmp_path, small_config):
 def test_results_of_an_earlier_end_go_when_the_run_is_prolonged(tmp_path, small_config):
     train(small_config(steps=2), tmp_path)
     assert (tmp_path / "report.md").exists()
-    run = TrainingRun(small_config(steps=1), tmp_path)
     with pytest.raises(CheckpointError, match="at step 2, beyond steps=1"):
-        run.run()
+        train(small_config(steps=1), tmp_path)
+    assert "steps: 2" in (tmp_path / "config.yaml").read_text()  # and not what was refused
     train(small_config(steps=4), tmp_path)
     assert "after 4 environment steps" in (tmp_path / "report.md").read_text()
 

@@ -1,6 +1,7 @@
 """A run stopped and resumed is the run never stopped, bit for bit."""
 
 import shutil
+from contextlib import closing
 
 import pytest
 import torch
@@ -11,10 +12,11 @@ from equirl.training.checkpoint import save_checkpoint
 
 def run(config, folder, stop_after=None) -> TrainingRun:
     folder.mkdir(exist_ok=True)
-    training = TrainingRun(config, folder)
-    if stop_after is not None:
-        training.should_stop = lambda: training.step >= stop_after
-    training.run()
+    with closing(TrainingRun(config, folder)) as training:
+        if stop_after is not None:
+            training.should_stop = lambda: training.step >= stop_after
+        training.restore()
+        training.run()
     return training
 
 
@@ -121,7 +123,7 @@ def test_checkpoints_load_without_executing_code(tmp_path):
             return print, ("executed",)
 
     path = tmp_path / "evil.pt"
-    torch.save({"format": 2, "payload": Payload()}, path)
+    torch.save({"format": 3, "payload": Payload()}, path)
     with pytest.raises(CheckpointError):
         load_checkpoint(path)
 
