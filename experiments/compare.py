@@ -1,21 +1,26 @@
 """Compares finished runs: learning curves and a table with success over seeds.
 
     python experiments/compare.py results/ "D4=outputs/d4_0,outputs/d4_1" "CNN=outputs/cnn_0"
+    python experiments/compare.py results/ outputs/sweeps/2026-01-31_12-00-00
 
 The first argument is the folder to write to; each further one names a group of runs and
-their folders. Writes ``curves.png``, ``runs.csv`` and ``table.md``.
+their folders, or is the folder of a run or of a sweep, each run then called by its folder's name.
+Writes ``curves.png``, ``runs.csv`` and ``table.md``.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from equirl.analysis import read_table, wilson_interval
+from equirl.analysis import TableError, read_table, wilson_interval
 from equirl.analysis.curves import plot_runs
 from equirl.analysis.tables import markdown_table, write_table
+
+TABLES = ("test", "timing", "validation", "metrics")
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -26,7 +31,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--title", default="")
     given = parser.parse_args(arguments)
     groups: dict[str, Sequence[Path]] = {}
-    for label, folders in given.groups:
+    for label, folders in itertools.chain.from_iterable(given.groups):
         groups[label] = [*groups.get(label, ()), *folders]
     rows = [summary(label, folder) for label, folders in groups.items() for folder in folders]
     table = markdown_table(rows[0], (row.values() for row in rows))
@@ -40,16 +45,37 @@ def main(arguments: list[str] | None = None) -> None:
     print(table)
 
 
-def group(text: str) -> tuple[str, list[Path]]:
-    """A label and the folders of runs, from the command line."""
-    label, _, names = text.partition("=")
+def group(text: str) -> list[tuple[str, list[Path]]]:
+    """Labels and the folders of their runs, from an argument of the command line."""
+    label, equals, names = text.partition("=")
+    if not equals:
+        runs = [Path(text), *sorted(table.parent for table in Path(text).glob("*/test.csv"))]
+        found = [(run.name, [run]) for run in runs if is_finished(run)]
+        if not found:
+            raise argparse.ArgumentTypeError(
+                f"expected LABEL=FOLDER[,FOLDER...] or the folder of finished runs, got {text!r}"
+            )
+        return found
     folders = [Path(name) for name in names.split(",") if name]
     if not label or not folders:
         raise argparse.ArgumentTypeError(f"expected LABEL=FOLDER[,FOLDER...], got {text!r}")
     for folder in folders:
-        if "success" not in read_table(folder / "test.csv"):
+        if not is_finished(folder):
             raise argparse.ArgumentTypeError(f"{folder} is not the folder of a finished run")
-    return label, folders
+    return [(label, folders)]
+
+
+def is_finished(folder: Path) -> bool:
+    """Whether a folder holds what a run ends with.
+
+    Raises:
+        argparse.ArgumentTypeError: One of its tables is damaged.
+    """
+    try:
+        tables = {name: read_table(folder / f"{name}.csv") for name in TABLES}
+    except TableError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return "success" in tables["test"]
 
 
 def summary(label: str, folder: Path) -> dict[str, str | int]:

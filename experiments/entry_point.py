@@ -92,8 +92,12 @@ def is_multirun() -> bool:
 
 def _mendable() -> tuple[type[Exception], ...]:
     """Errors that say by themselves what the user can do."""
+    from equirl.analysis import TableError
     from equirl.collectors import DemonstrationError
     from equirl.envs import PlacementError
     from equirl.training import CheckpointError, FolderError
 
-    return ConfigError, FolderError, CheckpointError, DemonstrationError, PlacementError
+    return (
+        *(ConfigError, FolderError, CheckpointError, TableError),
+        *(DemonstrationError, PlacementError),
+    )

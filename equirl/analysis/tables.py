@@ -6,20 +6,60 @@ import csv
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-__all__ = ["markdown_row", "markdown_table", "read_table", "write_table"]
+__all__ = [
+    "TableError",
+    "markdown_row",
+    "markdown_table",
+    "read_rows",
+    "read_table",
+    "write_table",
+]
+
+
+class TableError(ValueError):
+    """A file that is no table of numbers; the message names it and the line."""
 
 
 def read_table(path: Path) -> dict[str, list[float]]:
     """Reads a CSV table of numbers as columns; a missing or empty file has none.
 
     A last line cut short by a killed run is left out.
+
+    Raises:
+        TableError: The file is not such a table.
     """
+    rows = read_rows(path)
+    return {name: [row[name] for row in rows] for name in rows[0]} if rows else {}
+
+
+def read_rows(path: Path) -> list[dict[str, float]]:
+    """Reads what `read_table` reads, as rows."""
     if not path.exists():
-        return {}
-    with open(path, newline="") as file:
-        lines = [line for line in file if line.endswith("\n")]
-    rows = list(csv.DictReader(lines))
-    return {name: [float(row[name]) for row in rows] for name in rows[0]} if rows else {}
+        return []
+    try:
+        text = path.read_text()
+    except UnicodeDecodeError as error:
+        raise TableError(f"{path} is no table: {error}") from None
+    header, *lines = [line for line in text.splitlines(True) if line.endswith("\n")] or [""]
+    names = header.strip().split(",")
+    rows = []
+    for number, line in enumerate(lines, start=2):
+        try:
+            values = [_number(cell) for cell in line.split(",")]
+            rows.append(dict(zip(names, values, strict=True)))
+        except ValueError:
+            expected = f"numbers for the columns {header.strip()}"
+            raise TableError(
+                f"{path}, line {number}: expected {expected}, got {line.strip()[:80]!r}"
+            ) from None
+    return rows
+
+
+def _number(cell: str) -> float:
+    try:
+        return int(cell)  # seeds have more digits than a float holds
+    except ValueError:
+        return float(cell)
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, object]]) -> None:

@@ -40,7 +40,8 @@ def save_checkpoint(state: dict[str, Any], path: Path) -> None:
     except (OSError, RuntimeError) as error:
         partial.unlink(missing_ok=True)
         kept = "the previous checkpoint is kept" if path.exists() else "there is none yet"
-        raise CheckpointError(f"cannot write {path}: {error}; {kept}") from error
+        full = "" if isinstance(error, OSError) else " (is the disk full?)"  # torch's own words
+        raise CheckpointError(f"cannot write {path}: {error}{full}; {kept}") from error
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:

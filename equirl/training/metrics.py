@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from equirl.analysis import read_table
 from equirl.config import Config, ConfigError, flatten, write_atomically
 
 __all__ = ["Averages", "MetricsLog"]
@@ -33,13 +34,18 @@ class MetricsLog:
         self.trackers = _trackers(folder, config)
 
     def rewind(self, step: int) -> None:
-        """Drops the rows after ``step``, which a resumed run will write again; all at step 0."""
+        """Drops the rows after ``step``, which a resumed run will write again.
+
+        Raises:
+            TableError: A table is damaged; it is left as it is.
+        """
         for table in self.TABLES:
             path = self.folder / f"{table}.csv"
             if not path.exists():
                 continue
-            lines = [line for line in path.read_text().splitlines(True) if line.endswith("\n")]
-            kept = [line for line in lines[1:] if _step_of(line) <= step]
+            steps = read_table(path).get("step", [])  # a damaged table is refused here
+            lines = path.read_text().splitlines(True)
+            kept = [line for line, at in zip(lines[1:], steps, strict=False) if at <= step]
             write_atomically(path, "".join(lines[:1] + kept))
 
     def write(self, table: str, row: Row) -> None:
@@ -93,10 +99,6 @@ class Averages:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores what `state_dict` returned."""
         self._sums, self._count = dict(state["sums"]), state["count"]
-
-
-def _step_of(line: str) -> float:
-    return float(line.split(",", 1)[0])
 
 
 def _trackers(folder: Path, config: Config) -> list[Any]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import logging
 import re
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
-from equirl.analysis.tables import write_table
+from equirl.analysis.tables import read_rows, write_table
 from equirl.collectors import Episode
 from equirl.config import Config, ConfigError, save_config
 from equirl.training.environment import make_run_env
@@ -128,16 +127,15 @@ def write_evaluation(evaluation: Evaluation, path: Path) -> None:
 
 def read_evaluation(path: Path) -> Evaluation:
     """Reads what `write_evaluation` wrote."""
-    with open(path, newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = read_rows(path)
     return Evaluation(
         seeds=tuple(int(row["seed"]) for row in rows),
         episodes=tuple(
             Episode(
                 length=int(row["length"]),
-                success=row["success"] == "1",
-                undiscounted_return=float(row["return"]),
-                discounted_return=float(row["discounted_return"]),
+                success=row["success"] == 1,
+                undiscounted_return=row["return"],
+                discounted_return=row["discounted_return"],
             )
             for row in rows
         ),

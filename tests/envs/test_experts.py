@@ -39,7 +39,8 @@ def check(make, task: str, robot: str, clip: str, episodes: int, slack: float = 
     results = [run(env, expert, HELD_OUT + index) for index in range(episodes)]
     rewards = [reward for reward, *_ in results]
     assert np.mean(rewards) >= SUCCESS.get(task, 0.99) - slack
-    assert np.mean([length for _, length, _ in results]) <= (1.1 + slack) * LENGTHS[task]
+    if task in LENGTHS:  # the paper's
+        assert np.mean([length for _, length, _ in results]) <= (1.1 + slack) * LENGTHS[task]
     actions = torch.cat([actions for *_, actions in results])
     assert actions.abs().max() <= 1
     if clip == "norm":
@@ -49,7 +50,7 @@ def check(make, task: str, robot: str, clip: str, episodes: int, slack: float = 
 HELD_OUT = 10**6
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", [name for name, task in TASKS.items() if task().expert])
 def test_episodes_are_solved(make, task):
     # Ten heaps say little about lengths: most take 7 steps, a few take 30.
     check(make, task, "panda", "norm", 10, slack=0.5 if task == "clutter_grasping" else 0.0)

@@ -65,13 +65,14 @@ def test_bad_groups_of_runs_are_named(complaint, run, tmp_path):
         return complaint(compare.main, tmp_path / "out", *groups)
 
     assert "required: LABEL=FOLDER" in compared()
-    for text in (str(run), "D4=", f"={run}", "D4=,"):
+    for text in ("D4=", f"={run}", "D4=,"):
         assert f"expected LABEL=FOLDER[,FOLDER...], got '{text}'" in compared(text)
     for folder in ("/nonexistent", tmp_path):
         named = f"{folder} is not the folder of a finished run"
         assert named in compared(f"D4={run},{folder}")
     write_table(tmp_path / "test.csv", [{"return": 1}])
     assert "not the folder of a finished run" in compared(f"D4={tmp_path}")
+    assert "or the folder of finished runs, got '/nonexistent'" in compared("/nonexistent")
     assert not (tmp_path / "out").exists()
 
 

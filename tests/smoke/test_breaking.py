@@ -162,6 +162,19 @@ def test_a_truncated_checkpoint(length, whole, tmp_path):
     assert_same_tables(folder, whole)  # nothing was touched
 
 
+@pytest.mark.parametrize("damage", [b"\n", b"\xbb\n", b"a,b\n"])
+def test_a_damaged_table(damage, whole, tmp_path):
+    folder = shutil.copytree(whole, tmp_path / "run")
+    path = folder / "metrics.csv"
+    path.write_bytes(path.read_bytes() + damage)
+    damaged = path.read_bytes()
+    code, _, err = call("train.py", f"resume={folder}", "steps=70")
+    assert code == 1 and str(path) in sentence(err)
+    assert path.read_bytes() == damaged and "steps: 60" in (folder / "config.yaml").read_text()
+    code, _, err = call("compare.py", str(tmp_path / "out"), str(folder))
+    assert (code == 2 and f"{path}, line" in err) or "is no table" in err
+
+
 def test_two_runs_into_one_folder(tmp_path):
     folder = tmp_path / "run"
     first = start("train.py", *RUN, "steps=1000000", f"output={folder}")

@@ -1,36 +1,14 @@
 """Every entry point end to end, as a user calls it."""
 
 import csv
-import os
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
-SMOKE = ["preset=smoke", "group=c4", "env.robot=hand", "logging.progress=false", "threads=1"]
-
-
-def start(script: str, *arguments: str) -> subprocess.Popen:
-    command = [sys.executable, str(ROOT / "experiments" / script), *arguments]
-    environment = {key: value for key, value in os.environ.items() if key != "DISPLAY"}
-    return subprocess.Popen(
-        command,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        cwd=ROOT,
-        env=environment | {"HOME": "/nonexistent"},  # no wandb login, no caches to rely on
-    )
-
-
-def call(script: str, *arguments: str) -> tuple[int, str, str]:
-    process = start(script, *arguments)
-    out, err = process.communicate(timeout=300)
-    return process.returncode, out, err
+from equirl.envs.tasks import TASKS
+from tests.commands import SMOKE, call, start
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +35,7 @@ def test_training_leaves_a_folder_worth_opening(finished):
     assert list(finished.glob("tensorboard/**/events*"))
 
 
-@pytest.mark.parametrize("task", ["clutter_grasping", "block_pushing", "block_in_bowl"])
+@pytest.mark.parametrize("task", sorted(set(TASKS) - {"block_picking"}))
 def test_every_task_trains(task, tmp_path):
     options = ["env.options.lift_height=0.12"] if task == "clutter_grasping" else []
     code, out, err = call("train.py", *SMOKE, f"env={task}", *options, f"output={tmp_path / task}")
@@ -74,7 +52,8 @@ def test_an_impossible_scene_ends_in_one_sentence(tmp_path):
     arguments = ["env=block_pushing", "env.options.goal_distance=0.9", f"output={tmp_path / 'run'}"]
     code, _, err = call("train.py", *SMOKE, *arguments)
     assert code == 1 and "no place in 20000 tries for a goal" in err and "Traceback" not in err
-    code, _, err = call("train.py", *SMOKE, "env=block_pushing", "env.options.goal_sides=0.1")
+    arguments = ["env=block_pushing", "env.options.goal_sides=0.1", f"output={tmp_path / 'run'}"]
+    code, _, err = call("train.py", *SMOKE, *arguments)
     assert code == 1 and "env.options: BlockPushing has no option goal_sides" in err
 
 
@@ -146,6 +125,8 @@ def test_multirun_over_groups_and_copies(tmp_path):
     assert configs.count("group: D4") == 2 and configs.count("copies: 0") == 2
     code, out, err = call("evaluate.py", f"run={reports[0].parent}", "episodes=1")
     assert code == 0 and "of 1 episodes succeed" in out, err
+    code, out, err = call("compare.py", str(tmp_path / "comparison"), str(tmp_path))
+    assert code == 0 and all(f"| {report.parent.name} |" in out for report in reports), err
 
 
 def test_cnn_baseline(tmp_path):
@@ -170,12 +151,12 @@ def test_cnn_baseline(tmp_path):
         (["output=/proc/none"], "/proc/none"),
     ],
 )
-def test_bad_input_ends_in_a_sentence_that_names_it(arguments, named):
+def test_bad_input_ends_in_a_sentence_that_names_it(arguments, named, tmp_path):
     if arguments[0].startswith("--"):  # flags come before keys
         arguments = [arguments[0], *SMOKE, *arguments[1:]]
     elif not arguments[0].startswith("resume="):
         arguments = [*SMOKE, *arguments]
-    code, _, err = call("train.py", *arguments)
+    code, _, err = call("train.py", *arguments, cwd=tmp_path)
     assert code != 0
     assert named in err and "Traceback" not in err
 

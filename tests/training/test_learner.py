@@ -85,3 +85,4 @@ def test_train_returns_the_evaluation_it_reports(tmp_path, small_config):
     assert evaluation is not None and len(evaluation.episodes) == 2
     report = (tmp_path / "run" / "report.md").read_text()
     assert f"**{evaluation.success_rate:.0%} success** on 2 held-out scenes" in report
+    assert train(small_config(steps=4), tmp_path / "run") == evaluation  # read, not played again
