@@ -14,30 +14,33 @@ import argparse
 from collections.abc import Callable
 from typing import Any
 
+from command_line import at_least
+
+from equirl.analysis.tables import markdown_row, markdown_table
 from equirl.envs import make_env, make_expert
 from equirl.envs.tasks import TASKS
 from equirl.symmetry import EnvAudit, SymmetryGroup, audit_env
 from equirl.symmetry.audit_quantities import shown
-from equirl.symmetry.audit_result import markdown_table
 
 #: How the expert limits (x, y) of an action; random actions fill the box.
 ACTIONS = {"random": None, "expert": "norm", "expert_box": "box"}
 
 
-def main() -> None:
+def main(given: list[str] | None = None) -> None:
     """Audits and prints."""
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
     parser.add_argument("--actions", nargs="+", choices=ACTIONS, default=["random", "expert"])
     parser.add_argument("--group", default="D4")
-    parser.add_argument("--scenes", type=int, default=10)
-    parser.add_argument("--steps", type=int, default=8)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--image-size", type=int, default=128)
+    parser.add_argument("--scenes", type=at_least(1), default=10)
+    parser.add_argument("--steps", type=at_least(1), default=8)
+    parser.add_argument("--seed", type=at_least(0), default=0)
+    parser.add_argument("--image-size", type=at_least(2), default=128)
     parser.add_argument("--details", action="store_true")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(given)
     try:
         SymmetryGroup(arguments.group)
+        make_env(arguments.tasks[0], image_size=arguments.image_size)
     except ValueError as error:
         parser.error(str(error))
     print(markdown_table(["task", "actions", "robot", *COLUMNS], []))
@@ -48,7 +51,7 @@ def main() -> None:
             for robot in audit.environments:
                 cells = [task, actions, robot]
                 cells += [column(audit, robot) for column in COLUMNS.values()]
-                print(f"| {' | '.join(cells)} |", flush=True)
+                print(markdown_row(cells), flush=True)
             details += f"\n## {task}, actions: {actions}\n\n{audit}\n"
     if arguments.details:
         print(details)

@@ -9,7 +9,8 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NoReturn, TypeVar
 
@@ -28,9 +29,6 @@ os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL logs to the stan
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra hands its errors on; they are told below
 
-_log = logging.StreamHandler()  # for the package's own messages, to the standard error
-_failed: list[str] = []  # jobs of a multirun, each with its reason
-
 
 def entry_point(name: str, schema: type[Job]) -> Callable[[Callable[[Job], None]], Callable]:
     """Makes a command line of a function that takes a validated job.
@@ -42,23 +40,26 @@ def entry_point(name: str, schema: type[Job]) -> Callable[[Callable[[Job], None]
 
     def decorate(main: Callable[[Job], None]) -> Callable[[], None]:
         composed = False
+        failed: list[str] = []  # jobs of a multirun, each with its reason
 
         def job(values: DictConfig) -> None:
             nonlocal composed
             composed = True
-            logging.getLogger("equirl").addHandler(_log)
-            logging.getLogger("equirl").setLevel(logging.INFO)
             try:
-                main(to_config(values, schema))
-            except _mendable() as error:
+                with _messages():
+                    main(to_config(values, schema))
+            except Exception as error:  # and not an interrupt, that must not import anything
+                if not isinstance(error, _mendable()):
+                    raise
                 if not is_multirun():
                     sys.exit(f"error: {error}")
                 print(f"error: {error}", file=sys.stderr, flush=True)
-                _failed.append(f"{' '.join(HydraConfig.get().overrides.task)}: {error}")
+                failed.append(f"{' '.join(HydraConfig.get().overrides.task)}: {error}")
 
         def run() -> None:
             nonlocal composed
             composed = False
+            failed.clear()
             register()
             conf = Path(__file__).parents[1] / "conf"
             try:
@@ -69,12 +70,25 @@ def entry_point(name: str, schema: type[Job]) -> Callable[[Callable[[Job], None]
                 if composed:
                     raise
                 sys.exit(f"error: {explain(error, schema)}")
-            if _failed:
-                sys.exit("\n".join([f"{len(_failed)} jobs failed:", *_failed]))
+            if failed:
+                sys.exit("\n".join([f"{len(failed)} jobs failed:", *failed]))
 
         return run
 
     return decorate
+
+
+@contextmanager
+def _messages() -> Iterator[None]:
+    """Shows the package's own messages on the standard error."""
+    log, handler = logging.getLogger("equirl"), logging.StreamHandler()
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    log.disabled = False  # Hydra disables what was there before
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
 
 
 def stop(message: str) -> NoReturn:

@@ -14,7 +14,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from equirl.config import AlgorithmConfig
+from equirl.config.schema import AlgorithmConfig
 from equirl.modules import (
     EquivariantEncoder,
     EquivariantPolicy,

@@ -19,9 +19,8 @@ from command_line import at_least
 
 from equirl.envs.bullet import Camera
 from equirl.envs.bullet.floor import Viewpoint
-from equirl.envs.objects import ObjectSet
+from equirl.envs.objects import MeshError, MeshFolder, ObjectSet
 from equirl.envs.objects.household import household_objects
-from equirl.envs.objects.mesh_folder import MeshError, MeshFolder
 from equirl.envs.scene import Scene
 from equirl.envs.tasks.base import lying
 from equirl.envs.workspace import Bin, Workspace

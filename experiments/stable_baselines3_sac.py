@@ -30,7 +30,7 @@ except ModuleNotFoundError as error:
 
 from tensordict import TensorDict
 
-from equirl.envs import ManipulationEnv, make_expert
+from equirl.envs import ROBOTS, ManipulationEnv, make_expert
 from equirl.envs.gymnasium import GymnasiumEnv  # registers the environments too
 
 
@@ -88,7 +88,7 @@ def main(arguments: list[str] | None = None) -> SAC:
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     some, any_number = at_least(1), at_least(0)
     parser.add_argument("--env", default="equirl/BlockPicking-v0", choices=known)
-    parser.add_argument("--robot", default="panda", choices=["panda", "hand"])
+    parser.add_argument("--robot", default="panda", choices=list(ROBOTS))
     parser.add_argument("--image-size", type=some, default=32, help="pixels along a side")
     parser.add_argument("--steps", type=any_number, default=300, help="of training")
     parser.add_argument("--demos", type=any_number, default=5, help="episodes of the expert")

@@ -67,6 +67,7 @@ def _watch(
     job: WatchJob, config: Config, env: ManipulationEnv, policy: TensorDictModuleBase
 ) -> None:
     """Plays and draws; an episode goes on with the scene of the last where the task has it so."""
+    from equirl.training import describe_task
     from equirl.training.sheet import draw_sheet, outcome
     from equirl.training.video import open_film, record
 
@@ -86,7 +87,7 @@ def _watch(
                     add(frame)
                 if number <= job.sheet_episodes:
                     shown.append(frames)
-        title = f"{task.replace('_', ' ').capitalize()}: {job.policy}"
+        title = f"{describe_task(config)}: {job.policy}"
         draw_sheet(shown, env, sheet, title=title)
     except OSError as error:
         sys.exit(f"error: cannot write output={folder}: {error}")

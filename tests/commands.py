@@ -7,9 +7,13 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import imageio_ffmpeg
+import numpy as np
+
 ROOT = Path(__file__).parents[1]
 #: The smallest run there is.
 SMOKE = ["preset=smoke", "group=c4", "env.robot=hand", "logging.progress=false", "threads=1"]
+_started: list[subprocess.Popen] = []
 
 
 def start(script: str, *arguments: str, **options: Any) -> subprocess.Popen:
@@ -18,19 +22,37 @@ def start(script: str, *arguments: str, **options: Any) -> subprocess.Popen:
     environment = {key: value for key, value in os.environ.items() if key != "DISPLAY"}
     environment |= {"HOME": "/nonexistent"}  # no wandb login, no caches to rely on
     settings = {"cwd": tempfile.gettempdir(), "env": environment | options.pop("env", {})}
-    return subprocess.Popen(
+    process = subprocess.Popen(
         command,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         **{**settings, **options},
     )
+    _started.append(process)
+    return process
+
+
+def end_all() -> None:
+    """Ends what a test has left running."""
+    while _started:
+        process = _started.pop()
+        if process.poll() is None:
+            process.kill()
+            process.communicate()
 
 
 def finish(process: subprocess.Popen) -> tuple[int, str, str]:
     """Waits for the end; returns the exit code, the output and the complaints."""
     out, err = process.communicate(timeout=300)
     return process.returncode, out, err
+
+
+def frames_of(film: Path, side: int) -> np.ndarray:
+    """The frames of a film, shape (T, side, 2 side, 3)."""
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", film, "-f", "rawvideo"]
+    done = subprocess.run([*command, "-pix_fmt", "rgb24", "-"], capture_output=True, check=True)
+    return np.frombuffer(done.stdout, np.uint8).reshape(-1, side, 2 * side, 3)
 
 
 def call(script: str, *arguments: str, **options: Any) -> tuple[int, str, str]:

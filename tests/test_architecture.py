@@ -1,6 +1,8 @@
 """The direction of imports between the rooms of the package."""
 
 import ast
+import importlib
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -29,7 +31,7 @@ CONFINED = {
     "pybullet": "envs/bullet",
     "escnn": "modules/bases.py",
     "ctypes": "modules/native",
-    "hydra": "config.py",
+    "hydra": "config/",
     "wandb": "training/metrics.py",
     "imageio": "training/video.py",
     "gymnasium": "envs/gymnasium.py",
@@ -54,6 +56,9 @@ def imports(path: Path) -> set[str]:
             elif node.module:
                 names.add(node.module)
                 names |= {f"{node.module}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            # "module:name", looked up later (see equirl/config/schema.py).
+            names |= set(re.findall(r"^(equirl\.[\w.]+):\w+$", node.value))
     return names
 
 
@@ -75,6 +80,20 @@ def test_rooms_import_only_what_they_may(room):
 def test_every_room_is_listed():
     rooms = {path.relative_to(PACKAGE).with_suffix("").parts[0] for path in files()}
     assert rooms - {"__init__"} == set(ALLOWED)
+
+
+def test_what_files_take_from_one_another_is_public():
+    """Each file lists its public names, and others import nothing else from it."""
+    experiments = PACKAGE.parent / "experiments"
+    for path in [*files(), *experiments.glob("*.py")]:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("equirl"):
+                module = importlib.import_module(node.module)
+                public = set(module.__all__) if hasattr(module, "__all__") else set()
+                folder = Path(module.__file__).parent
+                below = {p.stem for p in folder.iterdir()} if hasattr(module, "__path__") else set()
+                taken = {alias.name for alias in node.names}
+                assert taken <= public | below, f"{path}: {node.module} {taken - public - below}"
 
 
 @pytest.mark.parametrize(("library", "place"), CONFINED.items())

@@ -107,7 +107,7 @@ def main() -> None:
     )
     box("training", 8.05, 1.15, 4.1, "Config", "every key, its default and its range")
     box("envs", 4.65, 1.15, 3.1, "Task", "scene, success, planner")
-    axes.text(0.35, 0.72, "→ networks, replay augmentation, audit", size=8.5, va="center")
+    axes.text(0.35, 0.72, "→ networks, replay augmentation", size=8.5, va="center")
     axes.text(4.75, 0.72, "→ environment, expert, films", size=8.5, va="center")
     axes.text(8.15, 0.72, "← command line, conf/*.yaml   → TrainingRun", size=8.5, va="center")
     x = 0.25

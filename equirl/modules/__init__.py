@@ -8,11 +8,13 @@ from equirl.modules.distributions import RadialTanhNormal
 from equirl.modules.encoder import EquivariantEncoder
 from equirl.modules.fields import FieldType
 from equirl.modules.filters import shared_filters
+from equirl.modules.methods import METHODS
 from equirl.modules.pooling import GroupMaxPool
 from equirl.modules.steerable import SteerableConv, SteerableLinear
 
 __all__ = [
     "BACKENDS",
+    "METHODS",
     "CNNEncoder",
     "EquivariantEncoder",
     "EquivariantPolicy",

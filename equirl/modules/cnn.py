@@ -8,7 +8,8 @@ from torch import Tensor, nn
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
 from equirl.modules.actor import LOG_STD_RANGE
-from equirl.modules.layout import check_sizes, convolve, resolve_device, skeleton, stack_observation
+from equirl.modules.device import resolve_device
+from equirl.modules.layout import check_sizes, convolve, skeleton, stack_observation
 from equirl.modules.wiring import as_actor, as_critic
 from equirl.symmetry import ACTION
 

@@ -8,8 +8,9 @@ import torch
 from torch import Tensor, nn
 
 from equirl.modules.backend import resolve_backend
+from equirl.modules.device import resolve_device
 from equirl.modules.fields import FieldType
-from equirl.modules.layout import check_sizes, convolve, resolve_device, skeleton, stack_observation
+from equirl.modules.layout import check_sizes, convolve, skeleton, stack_observation
 from equirl.modules.native import layer as native
 from equirl.modules.steerable import SteerableConv
 from equirl.symmetry import SymmetryGroup

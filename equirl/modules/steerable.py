@@ -11,9 +11,9 @@ from torch import Tensor, nn
 
 from equirl.modules.bases import KernelBasis
 from equirl.modules.blocks import Block, field_blocks, initial_weights
+from equirl.modules.device import resolve_device
 from equirl.modules.fields import FieldType
 from equirl.modules.filters import expanded_filter
-from equirl.modules.layout import resolve_device
 
 __all__ = ["SteerableConv", "SteerableLinear"]
 

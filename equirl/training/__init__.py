@@ -1,7 +1,7 @@
 """Training, checkpoints, evaluation and reports of runs."""
 
 from equirl.training.checkpoint import CheckpointError, load_checkpoint
-from equirl.training.environment import make_run_env, make_run_expert
+from equirl.training.environment import describe_task, make_run_env, make_run_expert
 from equirl.training.evaluation import Evaluation, evaluate
 from equirl.training.folder import CHECKPOINT, CONFIG, REPORT, FolderError, load_run_config
 from equirl.training.learner import Learner, load_policy
@@ -21,6 +21,7 @@ __all__ = [
     "Learner",
     "Purpose",
     "TrainingRun",
+    "describe_task",
     "evaluate",
     "film_policy",
     "load_checkpoint",

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import re
+
 from equirl.config import Config
 from equirl.envs import ManipulationEnv, make_env, make_expert
 from equirl.envs.expert import Expert
 from equirl.envs.tasks import find_task
 
-__all__ = ["make_run_env", "make_run_expert"]
+__all__ = ["describe_task", "make_run_env", "make_run_expert"]
+
+
+def describe_task(config: Config) -> str:
+    """The name of a run's task, for titles."""
+    name = find_task(config.env.task).__name__
+    return re.sub("(?<=[a-z])(?=[A-Z])", " ", name).capitalize()
 
 
 def make_run_env(config: Config) -> ManipulationEnv:

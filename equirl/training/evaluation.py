@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import torch
@@ -102,7 +102,7 @@ def play(
 def evaluate(
     env: EnvBase,
     policy: TensorDictModuleBase,
-    seeds: Sequence[int],
+    seeds: Iterable[int],
     *,
     discount: float = 0.99,
     device: torch.device | str = "cpu",
@@ -118,9 +118,11 @@ def evaluate(
         device: Where the policy lives.
         on_episode: Called after each episode, for progress.
     """
-    results = []
-    for seed in seeds:
-        results.append(play(env, policy, seed=seed, discount=discount, device=device))
-        if on_episode:
-            on_episode(results[-1])
-    return Evaluation(tuple(seeds), tuple(results))
+    played, results = [], []
+    with shared_filters():
+        for seed in seeds:
+            played.append(seed)
+            results.append(play(env, policy, seed=seed, discount=discount, device=device))
+            if on_episode:
+                on_episode(results[-1])
+    return Evaluation(tuple(played), tuple(results))

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +108,9 @@ class TrainingRun:
             return None
         if not self._train():
             return None
-        return self._evaluate(Purpose.TEST, self.config.evaluation.final_episodes)
+        episodes = self.config.evaluation.final_episodes
+        outcome = self._evaluate(Purpose.TEST, episodes)
+        return outcome if len(outcome.episodes) == episodes else None
 
     def close(self) -> None:
         """Ends the trackers and the simulations."""
@@ -196,7 +199,10 @@ class TrainingRun:
         self.log.write("timing", {"step": self.step, **self.clock.summary()})
 
     def _evaluate(self, purpose: Purpose, episodes: int) -> Evaluation:
-        seeds = [scene_seed(self.config.seed, purpose, index) for index in range(episodes)]
+        numbers: Iterable[int] = range(episodes)
+        if purpose is Purpose.TEST:  # a validation is a part of its step and always whole
+            numbers = takewhile(lambda _: not self.should_stop(), numbers)
+        seeds = (scene_seed(self.config.seed, purpose, number) for number in numbers)
         name = f"{purpose.name.lower()} scenes"
         bar = self.progress.bar(total=episodes, desc=name, unit="episode", leave=False)
         with self.clock.measure("evaluation"), bar as shown:

@@ -44,7 +44,7 @@ class MetricsLog:
             if not path.exists():
                 continue
             steps = read_table(path).get("step", [])  # a damaged table is refused here
-            lines = path.read_text().splitlines(True)
+            lines = [line for line in path.read_text().splitlines(True) if line.endswith("\n")]
             kept = [line for line, at in zip(lines[1:], steps, strict=False) if at <= step]
             write_atomically(path, "".join(lines[:1] + kept))
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from equirl.analysis import read_table
 from equirl.analysis.curves import plot_run
 from equirl.config import Config
+from equirl.training.environment import describe_task
 from equirl.training.evaluation import Evaluation
 from equirl.training.folder import CURVES, FILES, REPORT
 from equirl.training.networks import describe_method
@@ -33,7 +34,7 @@ def write_report(
     low, high = evaluation.interval
     solved = [episode.length for episode in evaluation.episodes if episode.success]
     lines = [
-        f"# {config.env.task.replace('_', ' ').capitalize()}, {describe_method(config)}",
+        f"# {describe_task(config)}, {describe_method(config)}",
         "",
         f"**{evaluation.success_rate:.0%} success** on {len(evaluation.episodes)} held-out "
         f"scenes (95 % confidence interval {low:.0%} to {high:.0%}), greedy policy, after "
@@ -68,7 +69,7 @@ def write_report(
     lines += [
         "| file | what |",
         "| --- | --- |",
-        *(f"| `{name}` | {what} |" for name, what in FILES.items()),
+        *(f"| `{name}` | {what} |" for name, what in FILES.items() if (folder / name).exists()),
         "",
     ]
     page = folder / REPORT

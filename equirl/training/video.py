@@ -16,7 +16,7 @@ from tensordict.nn import TensorDictModuleBase
 from equirl.envs import ManipulationEnv
 from equirl.training.evaluation import play
 
-__all__ = ["Frame", "film_policy", "open_film", "record"]
+__all__ = ["COLORS", "EXPONENT", "Frame", "film_policy", "open_film", "record"]
 
 _SIDE = 384  # pixels of each of the two pictures
 COLORS = "viridis_r"  # of depths; near is bright

@@ -14,8 +14,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from equirl.envs.objects import Body, ConvexPolyhedron, ObjectSet, convex_pieces
-from equirl.envs.objects.mesh_folder import MeshError, MeshFolder
+from equirl.envs.objects import (
+    Body,
+    ConvexPolyhedron,
+    MeshError,
+    MeshFolder,
+    ObjectSet,
+    convex_pieces,
+)
 
 trimesh = pytest.importorskip("trimesh")
 pytest.importorskip("coacd")

@@ -1,18 +1,16 @@
 """Looking at tasks, policies and objects, as a user calls it."""
 
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 import imageio.v2 as imageio
-import imageio_ffmpeg
-import numpy as np
 import object_sheet
 import pytest
 import watch as watch_script
 
 from equirl.config import to_config
+from tests.commands import frames_of
 
 SMALL = ["env.image_size=16", "env.robot=hand", "size=32"]
 
@@ -31,13 +29,6 @@ def watch(monkeypatch, capsys):
         return capsys.readouterr().out
 
     return call
-
-
-def frames_of(film: Path, side: int) -> np.ndarray:
-    """The frames of a film, shape (T, side, 2 side, 3)."""
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", film, "-f", "rawvideo"]
-    done = subprocess.run([*command, "-pix_fmt", "rgb24", "-"], capture_output=True, check=True)
-    return np.frombuffer(done.stdout, np.uint8).reshape(-1, side, 2 * side, 3)
 
 
 def check(folder: Path, printed: str, side: int) -> None:

@@ -1,11 +1,8 @@
 """Recordings of episodes, films and contact sheets."""
 
-import subprocess
 from itertools import pairwise
-from pathlib import Path
 
 import imageio.v2 as imageio
-import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
@@ -15,6 +12,7 @@ from equirl.envs import make_env, make_expert
 from equirl.training.evaluation import play
 from equirl.training.sheet import draw_sheet, outcome
 from equirl.training.video import film_policy, open_film, record
+from tests.commands import frames_of
 
 IDLE = TensorDictModule(lambda depth: torch.eye(5)[0], ["depth"], ["action"])  # stays open
 
@@ -52,13 +50,6 @@ def test_without_a_seed_a_recording_goes_on_with_the_scene():
     assert env.get_scene().names == objects
     assert np.abs(second[0].depth - first[-1].depth).mean() < 1e-3
     env.close()
-
-
-def frames_of(film: Path, side: int) -> np.ndarray:
-    """The frames of a film, shape (T, side, 2 side, 3)."""
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", film, "-f", "rawvideo"]
-    done = subprocess.run([*command, "-pix_fmt", "rgb24", "-"], capture_output=True, check=True)
-    return np.frombuffer(done.stdout, np.uint8).reshape(-1, side, 2 * side, 3)
 
 
 def test_a_film_has_a_frame_for_the_start_and_each_step(env, tmp_path):

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull, QhullError
 
-__all__ = ["Body", "ConvexPolyhedron", "cube"]
+__all__ = ["Body", "Color", "ConvexPolyhedron", "cube"]
 
 Color = tuple[float, float, float, float]
 

@@ -28,6 +28,7 @@ __all__ = [
     "SHORTEST_SIDE",
     "MeshError",
     "PieceCache",
+    "Pieces",
     "box_sides",
     "convex_pieces",
     "require_libraries",

@@ -14,6 +14,7 @@ import numpy as np
 from equirl.envs.objects.bodies import ConvexPolyhedron
 
 __all__ = [
+    "Pieces",
     "block",
     "both_sides",
     "chain",

@@ -1,0 +1,28 @@
+"""The configuration of a run: typed, validated, and the same with or without Hydra."""
+
+from equirl.config.declare import ConfigError, flatten
+from equirl.config.reading import (
+    explain,
+    load_config,
+    register,
+    save_config,
+    to_config,
+    write_atomically,
+)
+from equirl.config.schema import Config, EvaluateJob, TrainJob, WatchJob, is_free
+
+__all__ = [
+    "Config",
+    "ConfigError",
+    "EvaluateJob",
+    "TrainJob",
+    "WatchJob",
+    "explain",
+    "flatten",
+    "is_free",
+    "load_config",
+    "register",
+    "save_config",
+    "to_config",
+    "write_atomically",
+]

@@ -1,0 +1,272 @@
+"""The keys of a run: each with its type, default and range, and what it means."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any
+
+from omegaconf import MISSING
+
+from equirl.config.declare import ConfigError, at_least, checked, keys_of, one_of, within
+
+if TYPE_CHECKING:
+    from equirl.envs.tasks import Task
+
+__all__ = [
+    "AlgorithmConfig",
+    "AugmentationConfig",
+    "Config",
+    "DemosConfig",
+    "EnvConfig",
+    "EvaluateJob",
+    "EvaluationConfig",
+    "LoggingConfig",
+    "MethodConfig",
+    "ReplayConfig",
+    "TrainJob",
+    "WatchJob",
+    "is_free",
+]
+
+# Where the rooms list what there is to choose from.
+_MODES = "equirl.symmetry.spec:MODES"
+_BACKENDS = "equirl.modules.backend:BACKENDS"
+_METHODS = "equirl.modules.methods:METHODS"
+_ROBOTS = "equirl.envs:ROBOTS"
+
+
+@dataclass
+class EnvConfig:
+    """The task and what the robot sees of it."""
+
+    task: str = MISSING  # a file of equirl/envs/tasks, or "package.module:Class"
+    image_size: int = at_least(128, 2)  # pixels a side; networks take 16, 32, 64, 128 and 256
+    robot: str = one_of("panda", source=_ROBOTS)  # or "hand", flying freely
+    max_steps: int = at_least(50, 1)  # of an episode without success
+    options: dict[str, Any] = field(default_factory=dict)  # numbers of the task, see its file
+
+
+@dataclass
+class MethodConfig:
+    """The networks."""
+
+    name: str = one_of(MISSING, source=_METHODS)
+    hidden: int = at_least(64, 1)  # width n of the encoder (appendix A); the CNN scales with it
+    head_width: int = at_least(0, 0)  # fields of an equivariant critic head; 0: hidden (the paper)
+
+
+@dataclass
+class AlgorithmConfig:
+    """Soft actor-critic (appendix D)."""
+
+    name: str = one_of(MISSING, "sac")
+    learning_rate: float = within(1e-3, 0, 1)  # of Adam, for all parameters
+    batch_size: int = at_least(64, 1)  # transitions an update
+    discount: float = within(0.99, 0, 1)  # of the learner
+    tau: float = within(1e-2, 0, 1)  # share of the critic that moves into its target each update
+    alpha: float = within(1e-2, 0, 1e6)  # initial temperature
+    target_entropy: float = checked(-5.0, math.isfinite, "a finite number")
+    averaging: float = checked(0.0, lambda x: 0 <= x < 1, "0 or more, below 1")  # see Learner
+
+
+@dataclass
+class AugmentationConfig:
+    """Rotated copies of the replayed transitions (appendix F)."""
+
+    name: str = one_of(MISSING, "buffer", "none")
+    copies: int = at_least(4, 0)  # of each transition
+
+
+@dataclass
+class DemosConfig:
+    """Expert demonstrations stored before training."""
+
+    episodes: int = at_least(20, 0)
+    options: dict[str, Any] = field(default_factory=dict)  # CHOICES of the task's expert
+
+
+@dataclass
+class ReplayConfig:
+    """The replay buffer."""
+
+    capacity: int = at_least(100_000, 1)  # transitions, copies counted
+    start: int = at_least(100, 1)  # transitions stored, copies counted, before updates begin
+
+
+@dataclass
+class EvaluationConfig:
+    """Greedy evaluation on scenes that training never sees."""
+
+    every: int = at_least(200, 0)  # training steps between evaluations; 0: only after training
+    episodes: int = at_least(20, 1)  # validation scenes an evaluation
+    final_episodes: int = at_least(100, 1)  # test scenes after training
+    discount: float = within(0.99, 0, 1)  # of the returns reported, the paper's
+    video_episodes: int = at_least(3, 0)  # filmed after training; 0: no video
+
+
+@dataclass
+class LoggingConfig:
+    """Where metrics go beside the CSV files of the run's folder."""
+
+    progress: bool = True  # a bar on the standard error
+    tensorboard: bool = False
+    wandb: bool = False
+    wandb_mode: str = one_of("offline", "online")
+    wandb_project: str = "equirl"
+
+
+@dataclass
+class Config:
+    """A training run."""
+
+    env: EnvConfig = keys_of(EnvConfig)
+    method: MethodConfig = keys_of(MethodConfig)
+    algorithm: AlgorithmConfig = keys_of(AlgorithmConfig)
+    augmentation: AugmentationConfig = keys_of(AugmentationConfig)
+    demos: DemosConfig = keys_of(DemosConfig)
+    replay: ReplayConfig = keys_of(ReplayConfig)
+    evaluation: EvaluationConfig = keys_of(EvaluationConfig, free=True)
+    logging: LoggingConfig = keys_of(LoggingConfig, free=True)
+    mode: str = one_of("strict", source=_MODES)  # the mathematics, independent of sizes
+    group: str = "D4"  # C<n> or D<n>, n from 2 to 1000
+    steps: int = at_least(10_000, 1, free=True)  # environment steps, one update each
+    checkpoint_every: int = at_least(500, 1, free=True)  # steps
+    seed: int = at_least(0, 0)  # of networks, scenes, actions and replay
+    device: str = field(default="auto", metadata={"free": True})  # "auto", "cpu" or "cuda:<i>"
+    threads: int = at_least(0, 0, free=True)  # CPU threads of torch; 0: all cores
+    backend: str = one_of("auto", source=_BACKENDS, free=True)  # of equivariant encoders
+
+    @property
+    def torch_device(self) -> str:
+        """The device, ``"auto"`` resolved.
+
+        Raises:
+            ConfigError: This machine has none such.
+        """
+        from equirl.modules.device import resolve_device
+
+        try:
+            device = resolve_device(self.device)
+        except ValueError as error:
+            raise ConfigError(str(error)) from None
+        if device.type not in ("cpu", "cuda"):
+            raise ConfigError(f"device={self.device}: expected auto, cpu or cuda:<i>")
+        return str(device)
+
+    @property
+    def copies(self) -> int:
+        """Augmented copies of each stored transition."""
+        return self.augmentation.copies if self.augmentation.name == "buffer" else 0
+
+    def validated(self) -> Config:
+        """This configuration with the group's name in capitals, if its values fit together.
+
+        Raises:
+            ConfigError: They do not; the message names the first that does not.
+        """
+        from equirl.modules.layout import check_sizes
+        from equirl.symmetry import SymmetryGroup
+
+        try:
+            group = SymmetryGroup(self.group).name
+        except ValueError as error:
+            raise ConfigError(f"group={self.group}: {error}") from None
+        _check_expert(self.env, self.demos)
+        try:
+            check_sizes(self.method.hidden, self.env.image_size)
+        except ValueError as error:
+            raise ConfigError(f"method.hidden or env.image_size: {error}") from None
+        capacity, versions = self.replay.capacity, self.copies + 1
+        if capacity < versions:
+            raise ConfigError(f"replay.capacity={capacity}: expected {versions} or more")
+        if self.replay.start > capacity - capacity % versions:
+            raise ConfigError(
+                f"replay.start={self.replay.start}: the buffer of {capacity} transitions never "
+                "holds so many"
+            )
+        return replace(self, group=group)
+
+
+@dataclass
+class TrainJob(Config):
+    """What the command line of ``experiments/train.py`` takes: a run and its folder."""
+
+    output: str = ""  # the run's folder; a new one under outputs/ when empty
+    resume: str = ""  # folder of an interrupted run to go on with
+
+
+@dataclass
+class EvaluateJob:
+    """What the command line of ``experiments/evaluate.py`` takes."""
+
+    run: str = MISSING  # the folder of a run
+    episodes: int = at_least(100, 1)
+    first: int = at_least(0, 0)  # number of the first test scene
+    device: str = "auto"
+    backend: str = one_of("auto", source=_BACKENDS)
+    video: str = ""  # MP4 file to film the first episodes into
+    video_episodes: int = at_least(3, 1)
+
+
+@dataclass
+class WatchJob:
+    """What the command line of ``experiments/watch.py`` takes."""
+
+    env: EnvConfig = keys_of(EnvConfig)
+    policy: str = "expert"  # or "random", or the folder of a run, whose environment is then used
+    episodes: int = at_least(3, 1)
+    sheet_episodes: int = at_least(3, 1)  # the first ones, shown on the contact sheet
+    seed: int = at_least(0, 0)
+    output: str = ""  # a folder for film and sheet; outputs/watch/<task>/<policy> when empty
+    fps: int = at_least(4, 1)  # steps a second
+    # Pixels a side of each of the film's two pictures; video formats want an even number.
+    size: int = checked(384, lambda value: value >= 2 and value % 2 == 0, "2 or more, even")
+
+    def validated(self) -> WatchJob:
+        """This job, if its task exists and has what is to be watched.
+
+        Raises:
+            ConfigError: It has not.
+        """
+        task = _make_task(self.env)
+        if self.policy == "expert" and task.expert is None:
+            raise ConfigError(f"policy=expert: {self.env.task} has no expert; there is random")
+        return self
+
+
+def _make_task(env: EnvConfig) -> Task:
+    from equirl.envs.tasks import find_task, make_task
+
+    if env.image_size % 2:
+        raise ConfigError(f"env.image_size={env.image_size}: expected an even number")
+    try:
+        kind = find_task(env.task)
+    except ValueError as error:
+        raise ConfigError(f"env.task: {error}") from None
+    try:
+        return make_task(kind, **env.options)
+    except (ValueError, ImportError) as error:
+        raise ConfigError(f"env.options: {error}") from None
+
+
+def _check_expert(env: EnvConfig, demos: DemosConfig) -> None:
+    task = _make_task(env)
+    if not demos.episodes:
+        return
+    if task.expert is None:
+        raise ConfigError(f"demos.episodes={demos.episodes}: {env.task} has no expert; expected 0")
+    try:
+        task.expert.resolve(demos.options)
+    except ValueError as error:
+        raise ConfigError(f"demos.options: {error}") from None
+
+
+def is_free(key: str) -> bool:
+    """Whether a run may be resumed with another value: the key does not touch what is learned.
+
+    Args:
+        key: A key of `Config`, ``"env.task"``, or a group of them, ``"env"``.
+    """
+    known = {entry.name: entry.metadata.get("free", False) for entry in fields(Config)}
+    return known.get(key.partition(".")[0], False)

@@ -1,0 +1,35 @@
+"""Entry points in this process, which is quicker, and in processes that end with their test."""
+
+import importlib
+import sys
+
+import pytest
+
+from tests.commands import end_all
+
+
+@pytest.fixture(autouse=True)
+def processes():
+    """No process outlives the test that started it."""
+    yield
+    end_all()
+
+
+@pytest.fixture
+def here(monkeypatch, capsys):
+    """Calls an entry point in this process: its exit code, its output and its complaints."""
+
+    def call(script: str, *arguments: str) -> tuple[int, str, str]:
+        module = importlib.import_module(script.removesuffix(".py"))
+        monkeypatch.setattr(sys, "argv", [script, *arguments])
+        capsys.readouterr()
+        code, last = 0, ""
+        try:
+            module.main()
+        except SystemExit as exit:
+            code = exit.code if isinstance(exit.code, int) else int(exit.code is not None)
+            last = exit.code if isinstance(exit.code, str) else ""
+        out, err = capsys.readouterr()
+        return code, out, f"{err}\n{last}"
+
+    return call
