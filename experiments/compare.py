@@ -20,7 +20,13 @@ from equirl.analysis import TableError, read_table, wilson_interval
 from equirl.analysis.curves import plot_runs
 from equirl.analysis.tables import markdown_table, write_table
 
-TABLES = ("test", "timing", "validation", "metrics")
+#: The tables that are read, and their columns that are.
+NEEDED = {
+    "test.csv": ["success", "length"],
+    "validation.csv": ["step", "success_rate"],
+    "timing.csv": ["step", "minutes", "update_ms"],
+    "metrics.csv": ["step", "discounted_return"],
+}
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -72,10 +78,10 @@ def is_finished(folder: Path) -> bool:
         argparse.ArgumentTypeError: One of its tables is damaged.
     """
     try:
-        tables = {name: read_table(folder / f"{name}.csv") for name in TABLES}
+        tables = {name: read_table(folder / name, columns) for name, columns in NEEDED.items()}
     except TableError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
-    return "success" in tables["test"]
+    return bool(tables["test.csv"])
 
 
 def summary(label: str, folder: Path) -> dict[str, str | int]:

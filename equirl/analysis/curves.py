@@ -36,7 +36,8 @@ def plot_run(folder: Path, path: Path) -> None:
     if metrics:
         steps = metrics["step"]
         axes[1, 0].plot(steps, metrics["loss_qvalue"], color=_COLOURS[2], lw=1)
-        axes[1, 0].set(title="critic loss", yscale="log", xlabel="environment steps")
+        scale = "log" if max(metrics["loss_qvalue"]) > 0 else "linear"  # 0 before any update
+        axes[1, 0].set(title="critic loss", yscale=scale, xlabel="environment steps")
         axes[1, 1].plot(steps, metrics["entropy"], color=_COLOURS[3], lw=1)
         axes[1, 1].set(title="policy entropy (nats)", xlabel="environment steps")
     _save(figure, path)

@@ -20,15 +20,22 @@ class TableError(ValueError):
     """A file that is no table of numbers; the message names it and the line."""
 
 
-def read_table(path: Path) -> dict[str, list[float]]:
+def read_table(path: Path, needed: Sequence[str] = ()) -> dict[str, list[float]]:
     """Reads a CSV table of numbers as columns; a missing or empty file has none.
 
     A last line cut short by a killed run is left out.
+
+    Args:
+        path: The file.
+        needed: Columns that a table with rows must have.
 
     Raises:
         TableError: The file is not such a table.
     """
     rows = read_rows(path)
+    missing = [name for name in needed if rows and name not in rows[0]]
+    if missing:
+        raise TableError(f"{path}, line 1: expected a header with {', '.join(missing)}")
     return {name: [row[name] for row in rows] for name in rows[0]} if rows else {}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from difflib import get_close_matches
 from pathlib import Path
@@ -102,8 +103,10 @@ def load_config(path: Path) -> Config:
     try:
         values = OmegaConf.load(path)
         if not OmegaConf.is_dict(values):
-            raise ConfigError(f"{path} is not a configuration: expected keys and values")
+            raise ConfigError("expected keys and values")
         return to_config(values)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
     except FileNotFoundError:
         raise ConfigError(f"{path} not found: not the folder of a run") from None
     except (OSError, UnicodeError, YAMLError) as error:
@@ -111,10 +114,21 @@ def load_config(path: Path) -> Config:
         raise ConfigError(f"{path} is not a readable configuration: {reason}") from None
 
 
+def _shortened(name: str, longest: int = 200) -> str:
+    """A name that serves for a folder: what is too long ends in a digest of it."""
+    if len(name) <= longest:
+        return name
+    return f"{name[: longest - 9]}_{hashlib.blake2b(name.encode(), digest_size=4).hexdigest()}"
+
+
 def register() -> None:
-    """Makes the schema known to Hydra, so that every key of a YAML file is validated."""
+    """Makes the schema known to Hydra, so that every key of a YAML file is validated.
+
+    Also the resolver ``shortened``, for the folders of a sweep.
+    """
     from hydra.core.config_store import ConfigStore
 
+    OmegaConf.register_new_resolver("shortened", _shortened, replace=True)
     store = ConfigStore.instance()
     for name, schema in (("train_schema", TrainJob), ("watch_schema", WatchJob)):
         node = OmegaConf.structured(schema)

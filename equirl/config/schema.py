@@ -41,7 +41,7 @@ class EnvConfig:
     """The task and what the robot sees of it."""
 
     task: str = MISSING  # a file of equirl/envs/tasks, or "package.module:Class"
-    image_size: int = at_least(128, 2)  # pixels a side; networks take 16, 32, 64, 128 and 256
+    image_size: int = within(128, 1, 4096)  # pixels a side; networks take 16, 32, 64, 128, 256
     robot: str = one_of("panda", source=_ROBOTS)  # or "hand", flying freely
     max_steps: int = at_least(50, 1)  # of an episode without success
     options: dict[str, Any] = field(default_factory=dict)  # numbers of the task, see its file
@@ -221,7 +221,7 @@ class WatchJob:
     output: str = ""  # a folder for film and sheet; outputs/watch/<task>/<policy> when empty
     fps: int = at_least(4, 1)  # steps a second
     # Pixels a side of each of the film's two pictures; video formats want an even number.
-    size: int = checked(384, lambda value: value >= 2 and value % 2 == 0, "2 or more, even")
+    size: int = checked(384, lambda x: 2 <= x <= 4096 and x % 2 == 0, "an even number, 2 to 4096")
 
     def validated(self) -> WatchJob:
         """This job, if its task exists and has what is to be watched.

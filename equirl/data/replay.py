@@ -41,8 +41,16 @@ def make_replay_buffer(
         transforms.
 
     Raises:
-        ValueError: The capacity cannot hold one transition with its copies.
+        ValueError: A number is out of range, or the capacity cannot hold one transition with
+            its copies.
     """
+    for name, value, lowest in (
+        ("capacity", capacity, 1),
+        ("copies", copies, 0),
+        ("batch_size", batch_size, 1),
+    ):
+        if not isinstance(value, int) or value < lowest:
+            raise ValueError(f"{name}={value!r}: expected an integer of {lowest} or more")
     rows = capacity // (copies + 1)
     if rows < 1:
         raise ValueError(

@@ -24,12 +24,17 @@ class QuantizeDepth(Transform):
     Args:
         maximum: The largest depth stored, in m; observations are clipped there.
         in_keys: The depth images, each also looked up under ``"next"``.
+
+    Raises:
+        ValueError: The maximum is not above 0, or, at insertion, a depth is not finite.
     """
 
     _OFFSET = 2**15
     _LEVELS = 2**16 - 1
 
     def __init__(self, maximum: float, in_keys: Sequence[str] = ("depth",)):
+        if not 0 < maximum < math.inf:
+            raise ValueError(f"maximum={maximum!r}: expected a depth above 0, m")
         nested = [*in_keys, *(("next", key) for key in in_keys)]
         super().__init__(in_keys=nested, out_keys=nested, in_keys_inv=nested, out_keys_inv=nested)
         self.maximum = maximum
@@ -37,7 +42,10 @@ class QuantizeDepth(Transform):
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         out = tensordict.clone(recurse=False)
         for key in self.in_keys_inv:
-            level = (tensordict.get(key) * (self._LEVELS / self.maximum)).round()
+            depth = tensordict.get(key)
+            if not depth.isfinite().all():
+                raise ValueError(f"{key} holds numbers that are not finite: no depths")
+            level = (depth * (self._LEVELS / self.maximum)).round()
             level = level.clamp(0, self._LEVELS) - self._OFFSET
             out.set(key, level.to(torch.int16))
         return out
@@ -82,8 +90,8 @@ class RotationAugmentation(Transform):
         generator: torch.Generator | None = None,
         bounds: Mapping[NestedKey, tuple[float, float]] | None = None,
     ):
-        if copies < 0:
-            raise ValueError(f"augmentation copies must be 0 or more, got {copies}")
+        if not isinstance(copies, int) or copies < 0:
+            raise ValueError(f"copies={copies!r}: expected an integer of 0 or more")
         super().__init__()
         self.copies = copies
         self.spec = manipulation_spec() if spec is None else spec

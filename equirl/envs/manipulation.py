@@ -101,6 +101,8 @@ class ManipulationEnv(EnvBase):
         )
 
     def _set_seed(self, seed: int | None) -> None:
+        if seed is not None and seed < 0:
+            raise ValueError(f"seed must be a non-negative integer, got {seed}")
         self._seed_sequence = np.random.SeedSequence(seed)
         self._forget_scene()
 
@@ -182,7 +184,10 @@ class ManipulationEnv(EnvBase):
         return replace(scene, **robot)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        position, yaw, aperture = self._target(self.get_scene(), tensordict.get("action"))
+        action = tensordict.get("action", None)
+        if action is None:
+            raise ValueError(f"a step needs the key 'action', got {sorted(tensordict.keys())}")
+        position, yaw, aperture = self._target(self.get_scene(), action)
         self._connected().act(position, yaw, aperture)
         self._steps += 1
         state = self._measure()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictSequential
 from torch import Tensor
@@ -52,6 +54,7 @@ class SACLoss(TorchRLSACLoss):
 
     Raises:
         TypeError: The critic is not a sequence of an encoder and heads.
+        ValueError: A number is out of range.
     """
 
     def __init__(
@@ -67,6 +70,11 @@ class SACLoss(TorchRLSACLoss):
             raise TypeError(
                 "the critic must be a TensorDictSequential of two modules, an encoder and "
                 f"heads that return (B, heads); got {type(critic).__name__}"
+            )
+        if not 0 < gamma <= 1 or not math.isfinite(target_entropy) or not alpha_init > 0:
+            raise ValueError(
+                "expected gamma in (0, 1], a finite target_entropy and alpha_init above 0, got "
+                f"gamma={gamma}, target_entropy={target_entropy}, alpha_init={alpha_init}"
             )
         super().__init__(
             actor,

@@ -7,6 +7,7 @@ at all and read without executing code.
 from __future__ import annotations
 
 import os
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,10 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         CheckpointError: The file is missing, damaged, or of another format.
     """
     try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()  # checks sums that torch does not
+        if damaged:
+            raise zipfile.BadZipFile(f"its part {damaged} is damaged")
         state = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
         raise CheckpointError(f"no checkpoint at {path}") from None

@@ -11,14 +11,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
-from equirl.config import Config, flatten, load_config
-from equirl.training.checkpoint import check_same_config
+from equirl.config import Config, ConfigError, flatten, load_config
+from equirl.training.checkpoint import check_same_config, load_checkpoint
 
 __all__ = [
     "CHECKPOINT",
     "CONFIG",
     "CURVES",
     "FILES",
+    "METRICS",
     "REPORT",
     "TEST",
     "VIDEO",
@@ -31,12 +32,13 @@ __all__ = [
 ]
 
 CONFIG, CHECKPOINT, LOCK = "config.yaml", "checkpoint.pt", ".lock"
-TEST, REPORT, CURVES, VIDEO = "test.csv", "report.md", "curves.png", "policy.mp4"
+METRICS, TEST = "metrics.csv", "test.csv"
+REPORT, CURVES, VIDEO = "report.md", "curves.png", "policy.mp4"
 
 #: What a run leaves in its folder.
 FILES = {
     CONFIG: "the resolved configuration",
-    "metrics.csv": "a row a training episode",
+    METRICS: "a row a training episode",
     "validation.csv": "success of the greedy policy on the validation scenes, while training",
     TEST: "a row a test scene, after training",
     "timing.csv": "minutes so far, and milliseconds a call of each part of a step",
@@ -58,22 +60,42 @@ def check_folder(folder: Path, config: Config) -> None:
         FolderError: The folder holds files of something else.
         CheckpointError: It holds the checkpoint of a run of another configuration.
     """
-    partial = {path.name for path in folder.glob("*.partial")}  # of writings cut short
+    partial = {path.name for path in folder.glob("*.partial*")}  # of writings cut short
     others = {path.name for path in folder.iterdir()} - {LOCK} - partial
-    if (folder / CHECKPOINT).exists() and (folder / CONFIG).exists():
-        check_same_config(flatten(config), flatten(load_run_config(folder)), folder)
-    elif others and CONFIG not in others:
+    if not others:
+        return
+    if CONFIG not in others:
         raise FolderError(
             f"{folder} is not empty and not the folder of a run (it holds {sorted(others)[0]}); "
             "choose another"
         )
+    try:
+        stored = load_run_config(folder)
+    except ConfigError as error:
+        raise FolderError(
+            f"{folder} is not the folder of a run ({error}); choose another"
+        ) from None
+    if others & {CHECKPOINT, METRICS, TEST}:  # it has begun
+        check_same_config(flatten(config), flatten(stored), folder)
+    if TEST in others and CHECKPOINT not in others:
+        raise FolderError(
+            f"{folder} holds the results of a run whose {CHECKPOINT} is gone; choose another folder"
+        )
 
 
 def is_finished(folder: Path, config: Config) -> bool:
-    """Whether the folder holds the end of just this run."""
+    """Whether the folder holds the end of just this run.
+
+    Raises:
+        CheckpointError: Its checkpoint is damaged.
+    """
     if not all((folder / name).exists() for name in (CONFIG, CHECKPOINT, TEST, REPORT)):
         return False
-    return flatten(load_run_config(folder)) == flatten(config)
+    if flatten(load_run_config(folder)) != flatten(config):
+        return False
+    state = load_checkpoint(folder / CHECKPOINT)
+    check_same_config(flatten(config), state["config"], folder / CHECKPOINT)
+    return state["step"] == config.steps
 
 
 def load_run_config(folder: Path) -> Config:
@@ -133,7 +155,9 @@ def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
     def ask(number: int, frame: FrameType | None) -> None:
         nonlocal asked
         asked = True
-        print("\nstopping with a checkpoint; once more stops at once", file=sys.stderr, flush=True)
+        print(
+            "\nstopping soon, nothing is lost; once more stops at once", file=sys.stderr, flush=True
+        )
         for each in numbers:
             signal.signal(each, insist)
 

@@ -14,7 +14,7 @@ from torchrl.objectives import SoftUpdate
 
 from equirl.config import Config, flatten
 from equirl.objectives import SACLoss
-from equirl.training.checkpoint import check_same_config, load_checkpoint
+from equirl.training.checkpoint import CheckpointError, check_same_config, load_checkpoint
 from equirl.training.folder import CHECKPOINT, load_run_config
 from equirl.training.networks import make_networks
 
@@ -128,5 +128,7 @@ def load_policy(
     state = load_checkpoint(folder / CHECKPOINT)
     check_same_config(flatten(config), state["config"], folder / CHECKPOINT)
     learner = Learner(config)
+    if "learner" not in state:
+        raise CheckpointError(f"{folder / CHECKPOINT} lacks 'learner'")
     learner.load_state_dict(state["learner"])
     return config, learner.policy

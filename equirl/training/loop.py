@@ -94,7 +94,11 @@ class TrainingRun:
         """
         path = self.folder / CHECKPOINT
         if path.exists():
-            self._restore(load_checkpoint(path), path)
+            state = load_checkpoint(path)
+            try:
+                self._restore(state, path)
+            except KeyError as error:
+                raise CheckpointError(f"{path} lacks {error}") from error
             _log.info("goes on after step %d", self.step)
         self.log.rewind(self.step)
 

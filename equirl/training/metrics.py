@@ -43,7 +43,7 @@ class MetricsLog:
             path = self.folder / f"{table}.csv"
             if not path.exists():
                 continue
-            steps = read_table(path).get("step", [])  # a damaged table is refused here
+            steps = read_table(path, ["step"]).get("step", [])  # a damaged table is refused here
             lines = [line for line in path.read_text().splitlines(True) if line.endswith("\n")]
             kept = [line for line, at in zip(lines[1:], steps, strict=False) if at <= step]
             write_atomically(path, "".join(lines[:1] + kept))
@@ -117,8 +117,8 @@ def _trackers(folder: Path, config: Config) -> list[Any]:
         import wandb
         from torchrl.record.loggers.wandb import WandbLogger
 
-        trackers.append(
-            WandbLogger(
+        try:
+            tracker = WandbLogger(
                 exp_name=folder.name,
                 offline=config.logging.wandb_mode == "offline",
                 save_dir=str(folder),
@@ -126,5 +126,7 @@ def _trackers(folder: Path, config: Config) -> list[Any]:
                 config=flatten(config),
                 settings=wandb.Settings(silent=True),
             )
-        )
+        except wandb.Error as error:  # without an account, say
+            raise ConfigError(f"logging.wandb=true: {error}") from error
+        trackers.append(tracker)
     return trackers

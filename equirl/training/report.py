@@ -6,7 +6,7 @@ from pathlib import Path
 
 from equirl.analysis import read_table
 from equirl.analysis.curves import plot_run
-from equirl.config import Config
+from equirl.config import Config, write_atomically
 from equirl.training.environment import describe_task
 from equirl.training.evaluation import Evaluation
 from equirl.training.folder import CURVES, FILES, REPORT
@@ -69,9 +69,13 @@ def write_report(
     lines += [
         "| file | what |",
         "| --- | --- |",
-        *(f"| `{name}` | {what} |" for name, what in FILES.items() if (folder / name).exists()),
+        *(
+            f"| `{name}` | {what} |"
+            for name, what in FILES.items()
+            if name == REPORT or (folder / name).exists()
+        ),
         "",
     ]
     page = folder / REPORT
-    page.write_text("\n".join(lines))
+    write_atomically(page, "\n".join(lines))
     return page

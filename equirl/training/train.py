@@ -81,7 +81,7 @@ def _memory_told() -> Iterator[None]:
     try:
         yield
     except (MemoryError, RuntimeError) as error:
-        text = str(error)
+        text = str(error) or "out of memory"
         asked = re.search(r"allocate (\d+) bytes", text)
         if not (asked or "out of memory" in text or "multiplication overflow" in text):
             raise

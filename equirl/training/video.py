@@ -126,13 +126,16 @@ def open_film(path: Path, *, fps: int = 4) -> Iterator[Callable[[Frame], None]]:
         OSError: The file cannot be written.
     """
     import imageio.v2 as imageio
+    import imageio_ffmpeg
 
     path.open("wb").close()  # the encoder is a process of its own and would fail in silence
     writer: Any = imageio.get_writer(path, fps=fps, macro_block_size=None, quality=7)
     with writer:
         yield lambda frame: writer.append_data(np.hstack([frame.picture, _depth_picture(frame)]))
-    if path.stat().st_size == 0:
-        raise OSError(f"nothing could be written to {path}; is the disk full?")
+    try:
+        imageio_ffmpeg.count_frames_and_secs(path)
+    except RuntimeError:
+        raise OSError(f"{path} could not be written; is the disk full?") from None
 
 
 def _depth_picture(frame: Frame) -> np.ndarray:

@@ -140,7 +140,15 @@ def test_state_restores_rows_cursor_and_draws():
 
 
 def test_bad_arguments_are_named():
-    with pytest.raises(ValueError, match="copies must be 0 or more, got -1"):
+    with pytest.raises(ValueError, match="copies=-1: expected an integer of 0 or more"):
         RotationAugmentation(-1)
+    for arguments in ({"copies": -1}, {"batch_size": 0}, {"capacity": 2.5}, {"max_depth": 0.0}):
+        with pytest.raises(ValueError, match="expected"):
+            make_replay_buffer(**arguments)
+    buffer = make_replay_buffer(10, copies=0)
+    data = transitions(2)
+    data["depth"][0, 0, 0, 0] = float("nan")
+    with pytest.raises(ValueError, match="depth holds numbers that are not finite"):
+        buffer.extend(data)
     with pytest.raises(ValueError, match="capacity 3 cannot hold .* 4 copies"):
         make_replay_buffer(3, copies=4)

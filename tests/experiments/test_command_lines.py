@@ -71,7 +71,7 @@ def test_bad_groups_of_runs_are_named(complaint, run, tmp_path):
         named = f"{folder} is not the folder of a finished run"
         assert named in compared(f"D4={run},{folder}")
     write_table(tmp_path / "test.csv", [{"return": 1}])
-    assert "not the folder of a finished run" in compared(f"D4={tmp_path}")
+    assert "test.csv, line 1: expected a header with success, length" in compared(f"D4={tmp_path}")
     assert "or the folder of finished runs, got '/nonexistent'" in compared("/nonexistent")
     assert not (tmp_path / "out").exists()
 

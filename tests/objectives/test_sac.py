@@ -219,3 +219,6 @@ def test_a_critic_of_another_form_is_refused():
     actor, critic = networks()
     with pytest.raises(TypeError, match="a TensorDictSequential of two modules"):
         SACLoss(actor, critic.module[1])
+    for number in ({"gamma": 2.0}, {"target_entropy": float("nan")}, {"alpha_init": 0.0}):
+        with pytest.raises(ValueError, match="expected gamma in"):
+            SACLoss(actor, critic, **number)

@@ -185,17 +185,65 @@ def test_a_truncated_checkpoint(here, length, whole, tmp_path):
     assert_same_tables(folder, whole)  # nothing was touched
 
 
-@pytest.mark.parametrize("damage", [b"\n", b"\xbb\n", b"a,b\n"])
+@pytest.mark.parametrize("damage", [b"\n", b"\xbb\n", b"a,b\n", None])
 def test_a_damaged_table(here, damage, whole, tmp_path):
     folder = shutil.copytree(whole, tmp_path / "run")
     path = folder / "metrics.csv"
-    path.write_bytes(path.read_bytes() + damage)
+    content = path.read_bytes()
+    path.write_bytes(content.partition(b"\n")[2] if damage is None else content + damage)
     damaged = path.read_bytes()
     code, _, err = here("train.py", f"resume={folder}", "steps=170")
     assert code == 1 and str(path) in sentence(err)
     assert path.read_bytes() == damaged and "steps: 150" in (folder / "config.yaml").read_text()
     code, _, err = here("compare.py", str(tmp_path / "out"), str(folder))
     assert code == 2 and (f"{path}, line" in err or f"{path} is no table" in err)
+
+
+def test_a_checkpoint_whose_bytes_have_changed(here, whole, tmp_path):
+    """Torch does not look at the check sums; a run must not go on with other numbers."""
+    folder = shutil.copytree(whole, tmp_path / "run")
+    path = folder / "checkpoint.pt"
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    path.write_bytes(content)
+    code, _, err = here("train.py", f"resume={folder}", "steps=170")
+    assert code == 1 and "is damaged" in sentence(err)
+    assert_same_tables(folder, whole)
+
+
+def test_a_configuration_edited_by_hand(here, whole, tmp_path):
+    folder = shutil.copytree(whole, tmp_path / "run")
+    path = folder / "config.yaml"
+    path.write_text(path.read_text().replace("tau: 0.01", "tau: 0.5"))
+    code, _, err = here("train.py", f"resume={folder}")
+    assert code == 1 and "algorithm.tau is 0.01 there and 0.5 here" in sentence(err)
+
+
+def test_a_folder_whose_configuration_is_not_a_runs(here, tmp_path):
+    (tmp_path / "config.yaml").write_text("colour: red\n")
+    code, _, err = here("train.py", *RUN, f"output={tmp_path}")
+    assert code == 1 and "colour: there is no such key" in sentence(err)
+    assert (tmp_path / "config.yaml").read_text() == "colour: red\n"
+
+
+def test_results_without_their_checkpoint_are_kept(here, whole, tmp_path):
+    folder = shutil.copytree(whole, tmp_path / "run")
+    (folder / "checkpoint.pt").unlink()
+    for changes, named in (([], "whose checkpoint.pt is gone"), (["seed=4"], "seed is 0 there")):
+        code, _, err = here("train.py", *RUN, *changes, f"output={folder}")
+        assert code == 1 and named in sentence(err)
+    assert_same_tables(folder, whole)
+
+
+def test_folders_of_a_sweep_have_names_that_fit(here, tmp_path):
+    keys = [f"env.options.{name}=0.1" for name in ("goal_side", "goal_raise", "reach", "margin")]
+    sweep = [*RUN, "env=block_pushing", "steps=1", "demos.episodes=0", *keys, "group=c2,c4"]
+    sweep += ["env.options.start_half_width=0.05", "env.options.goal_half_width=0.05"]
+    sweep += ["env.options.goal_distance=0.01", "evaluation.discount=0.98", "replay.start=99"]
+    code, _, err = here("train.py", "--multirun", *sweep, f"hydra.sweep.dir={tmp_path}")
+    assert code == 0, err
+    names = [path.name for path in tmp_path.iterdir() if path.is_dir()]
+    assert len(names) == 2 and all(len(name) == 200 for name in names)
 
 
 def test_two_runs_into_one_folder(here, tmp_path):

@@ -95,7 +95,7 @@ def test_the_policy_of_a_run_in_its_own_environment(watch, tmp_path, monkeypatch
         (["env.max_steps=0"], "env.max_steps=0: expected 1 or more"),
         (["env.image_size=7"], "env.image_size=7: expected an even number"),
         (["episodes=0"], "episodes=0: expected 1 or more"),
-        (["size=33"], "size=33: expected 2 or more, even"),
+        (["size=33"], "size=33: expected an even number"),
         (["fps=slow"], "slow"),
         (["output=/proc/none"], "cannot write output=/proc/none"),
     ],

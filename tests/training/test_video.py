@@ -64,7 +64,10 @@ def test_a_film_has_a_frame_for_the_start_and_each_step(env, tmp_path):
 def test_a_film_that_cannot_be_written_says_so(env, tmp_path):
     with pytest.raises(OSError, match="missing"):
         film_policy(env, IDLE, [0], tmp_path / "missing" / "film.mp4")
-    with pytest.raises(OSError, match="nothing could be written"), open_film(tmp_path / "no.mp4"):
+    with (
+        pytest.raises(OSError, match="no.mp4 could not be written"),
+        open_film(tmp_path / "no.mp4"),
+    ):
         pass
 
 

@@ -24,6 +24,7 @@ __all__ = ["ClutterGrasping", "ClutterGraspingExpert"]
 
 # The robot waits 0.45 m high; the largest objects reach 0.1 m from their centres.
 _HIGHEST_DROP = 0.35  # m
+_MOST_OBJECTS = 50  # of the smallest household objects, in two layers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,6 +59,7 @@ class ClutterGrasping(LiftTask):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.require_positive("object_count", "smallest_scale", "largest_scale", "drop_height")
+        self.require_below("object_count", _MOST_OBJECTS + 1, "more than the bin holds")
         self.require_below("drop_height", _HIGHEST_DROP, "or objects would touch the robot (m)")
         self.require(
             "largest_scale",
