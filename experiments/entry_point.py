@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import NoReturn, TypeVar
 
 import hydra
@@ -62,20 +63,31 @@ def entry_point(name: str, schema: type[Job]) -> Callable[[Callable[[Job], None]
             failed.clear()
             register()
             conf = Path(__file__).parents[1] / "conf"
+            previous = signal.signal(signal.SIGINT, _end)
             try:
                 hydra.main(version_base="1.3", config_path=str(conf), config_name=name)(job)()
-            except KeyboardInterrupt:
-                stop("stopped")
             except Exception as error:
                 if composed:
                     raise
                 sys.exit(f"error: {explain(error, schema)}")
+            finally:
+                if signal.getsignal(signal.SIGINT) is _end:  # else it was stopped for good
+                    signal.signal(signal.SIGINT, previous)
             if failed:
                 sys.exit("\n".join([f"{len(failed)} jobs failed:", *failed]))
 
         return run
 
     return decorate
+
+
+def _end(number: int, frame: FrameType | None) -> None:
+    """Ends the process at an interrupt: outside of training there is nothing to be saved.
+
+    An exception would not do: libraries that are being imported swallow it or are torn apart.
+    """
+    os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, b"\nstopped\n")
+    os._exit(130)
 
 
 @contextmanager

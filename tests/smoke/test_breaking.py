@@ -83,9 +83,8 @@ def test_ctrl_c_while_training(here, count, whole, tmp_path):
         process.send_signal(signal.SIGINT)
         time.sleep(0.03)
     code, _, err = finish(process)
-    # With three the interpreter may be told again while it is ending.
-    assert code == 130 or (count == 3 and code == -signal.SIGINT), err
-    assert "Traceback" not in err and (count == 3 or str(folder) in err)
+    assert code == 130 and "Traceback" not in err, err
+    assert count > 1 or str(folder) in err  # a further one may cut the last words short
     assert here("train.py", f"resume={folder}")[0] == 0
     assert_same_tables(folder, whole)
 
@@ -93,10 +92,10 @@ def test_ctrl_c_while_training(here, count, whole, tmp_path):
 def test_ctrl_c_while_starting(tmp_path):
     """Imports take seconds; nothing has been written yet."""
     process = start("train.py", *RUN, f"output={tmp_path / 'run'}")
-    time.sleep(1.5)
+    wait_for(lambda: "torch" in Path(f"/proc/{process.pid}/maps").read_text())
     process.send_signal(signal.SIGINT)
     code, _, err = finish(process)
-    assert code in (130, -signal.SIGINT) and err.count("Traceback") <= (code != 130)
+    assert code == 130 and err.endswith("\nstopped\n") and not (tmp_path / "run").exists()
 
 
 def test_ctrl_c_while_testing(here, tmp_path):
