@@ -4,7 +4,7 @@
     python experiments/compare.py results/ outputs/sweeps/2026-01-31_12-00-00
 
 The first argument is the folder to write to; each further one names a group of runs and
-their folders, or is the folder of a run or of a sweep, each run then called by its folder's name.
+their folders, or is the folder of a sweep, its runs then called by what differs among them.
 Writes ``curves.png``, ``runs.csv`` and ``table.md``.
 """
 
@@ -19,6 +19,7 @@ from pathlib import Path
 from equirl.analysis import TableError, read_table, wilson_interval
 from equirl.analysis.curves import plot_runs
 from equirl.analysis.tables import markdown_table, write_table
+from equirl.config import ConfigError, flatten, load_config
 
 #: The tables that are read, and their columns that are.
 NEEDED = {
@@ -56,7 +57,7 @@ def group(text: str) -> list[tuple[str, list[Path]]]:
     label, equals, names = text.partition("=")
     if not equals:
         runs = [Path(text), *sorted(table.parent for table in Path(text).glob("*/test.csv"))]
-        found = [(run.name, [run]) for run in runs if is_finished(run)]
+        found = labelled([run for run in runs if is_finished(run)])
         if not found:
             raise argparse.ArgumentTypeError(
                 f"expected LABEL=FOLDER[,FOLDER...] or the folder of finished runs, got {text!r}"
@@ -69,6 +70,19 @@ def group(text: str) -> list[tuple[str, list[Path]]]:
         if not is_finished(folder):
             raise argparse.ArgumentTypeError(f"{folder} is not the folder of a finished run")
     return [(label, folders)]
+
+
+def labelled(runs: list[Path]) -> list[tuple[str, list[Path]]]:
+    """Runs with labels that say in which keys they differ, or their folders' names."""
+    try:
+        configs = [flatten(load_config(run / "config.yaml")) for run in runs]
+    except ConfigError:
+        configs = []
+    keys = [key for key in (configs or [{}])[0] if len({str(each[key]) for each in configs}) > 1]
+    if not keys:
+        return [(run.name, [run]) for run in runs]
+    labels = [", ".join(f"{key}={config[key]}" for key in keys) for config in configs]
+    return [(label, [run]) for label, run in zip(labels, runs, strict=True)]
 
 
 def is_finished(folder: Path) -> bool:

@@ -126,7 +126,8 @@ def test_multirun_over_groups_and_copies(here, tmp_path):
     code, out, err = here("evaluate.py", f"run={reports[0].parent}", "episodes=1")
     assert code == 0 and "of 1 episodes succeed" in out, err
     code, out, err = here("compare.py", str(tmp_path / "comparison"), str(tmp_path))
-    assert code == 0 and all(f"| {report.parent.name} |" in out for report in reports), err
+    assert code == 0 and "| augmentation.copies=2, group=D4 |" in out, err
+    assert all(f"| {report.parent.name} |" in out for report in reports)
 
 
 def test_cnn_baseline(here, tmp_path):
