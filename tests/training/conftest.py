@@ -3,6 +3,7 @@
 import pytest
 
 from equirl.config import to_config
+from equirl.envs import make_env
 
 SMALL = {
     "env": {"task": "block_picking", "image_size": 16, "max_steps": 12, "robot": "hand"},
@@ -30,3 +31,11 @@ def merged(base: dict, changes: dict) -> dict:
 def small_config():
     """A function of the changes to a configuration that trains in a second."""
     return lambda **changes: to_config(merged(SMALL, changes))
+
+
+@pytest.fixture
+def env():
+    """Episodes of at most ten steps, on pictures of 16 pixels."""
+    env = make_env("block_picking", image_size=16, robot="hand", max_steps=10)
+    yield env
+    env.close()

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
 from equirl.collectors import DemonstrationError, OnlineCollector
-from equirl.envs import make_env, make_expert
+from equirl.envs import make_expert
 from equirl.modules import make_actor, make_cnn_actor, shared_filters
 from equirl.modules.native.spectral import SpectralBasis
 from equirl.modules.steerable import _Steerable
@@ -35,13 +35,6 @@ def test_seeds_of_different_purposes_never_meet():
     assert len(set(seeds)) == len(seeds)
     assert len({seed >> 56 for seed in seeds}) == len(Purpose)  # disjoint by construction
     assert max(seeds) < 2**59 and scene_seed(1, Purpose.TEST, 5) == scene_seed(1, Purpose.TEST, 5)
-
-
-@pytest.fixture
-def env():
-    env = make_env("block_picking", image_size=16, robot="hand", max_steps=10)
-    yield env
-    env.close()
 
 
 def test_evaluation_of_the_expert_and_of_idling(env):

@@ -17,13 +17,6 @@ from tests.commands import frames_of
 IDLE = TensorDictModule(lambda depth: torch.eye(5)[0], ["depth"], ["action"])  # stays open
 
 
-@pytest.fixture
-def env():
-    env = make_env("block_picking", image_size=16, robot="hand", max_steps=10)
-    yield env
-    env.close()
-
-
 def test_a_recording_is_what_the_environment_gives_and_gets(env):
     frames = record(env, make_expert(env), seed=3, side=32)
     assert len(frames) - 1 == play(env, make_expert(env), seed=3).length
