@@ -86,7 +86,7 @@ def _end(number: int, frame: FrameType | None) -> None:
 
     An exception would not do: libraries that are being imported swallow it or are torn apart.
     """
-    os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, b"\nstopped\n")
+    os.write(2, b"\nstopped\n")  # past buffers that the interrupted code may hold
     os._exit(130)
 
 

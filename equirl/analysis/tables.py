@@ -40,7 +40,11 @@ def read_table(path: Path, needed: Sequence[str] = ()) -> dict[str, list[float]]
 
 
 def read_rows(path: Path) -> list[dict[str, float]]:
-    """Reads what `read_table` reads, as rows."""
+    """Reads what `read_table` reads, as rows.
+
+    Raises:
+        TableError: The file is not such a table.
+    """
     if not path.exists():
         return []
     try:

@@ -49,7 +49,11 @@ class TrainingRun:
     Args:
         config: The run's configuration.
         folder: Existing folder for metrics and checkpoints.
-        should_stop: Asked after each step; True ends the run with a checkpoint.
+        should_stop: Asked after each step, each demonstration and before each test scene; True
+            ends the run, with a checkpoint once training has begun.
+
+    Raises:
+        ConfigError: A device, processors, a backend or a tracker that this machine does not have.
     """
 
     def __init__(
@@ -90,7 +94,9 @@ class TrainingRun:
         """Goes on where the folder's checkpoint is, if there is one.
 
         Raises:
-            CheckpointError: It is of another configuration, or of a step beyond the last one.
+            CheckpointError: It is damaged, incomplete, of another configuration, or of a step
+                beyond the last one.
+            TableError: A table is damaged; it is left as it is.
         """
         path = self.folder / CHECKPOINT
         if path.exists():

@@ -52,7 +52,9 @@ def train(config: Config, folder: str | Path) -> Evaluation | None:
             is using it.
         CheckpointError: The folder holds a run of another configuration, or a
             checkpoint cannot be written or read.
+        TableError: A table of the run to go on with is damaged.
         DemonstrationError: The expert does not solve the task as configured.
+        PlacementError: The task's numbers allow no scene.
         KeyboardInterrupt: At the second Ctrl-C; what the checkpoint holds is safe.
     """
     folder = Path(folder)
@@ -126,7 +128,11 @@ def write_evaluation(evaluation: Evaluation, path: Path) -> None:
 
 
 def read_evaluation(path: Path) -> Evaluation:
-    """Reads what `write_evaluation` wrote."""
+    """Reads what `write_evaluation` wrote.
+
+    Raises:
+        TableError: The file is damaged.
+    """
     rows = read_rows(path)
     return Evaluation(
         seeds=tuple(int(row["seed"]) for row in rows),
