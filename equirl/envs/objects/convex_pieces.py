@@ -10,6 +10,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import threading
 import uuid
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
@@ -279,11 +280,11 @@ def _read_pieces(file: Path) -> Pieces:
 
 
 class PieceCache:
-    """Pieces by key, in a folder that other processes may use at the same time."""
+    """Pieces by key, in a folder that other threads and processes may use at the same time."""
 
     def __init__(self, folder: Path):
         self._folder = folder
-        self._writable = True
+        self._first_failure = threading.Lock()  # taken by it, and never given back
 
     def get(self, key: str, make: Callable[[], Pieces]) -> Pieces:
         """Returns the pieces stored under ``key``, or else those of ``make``, which it stores."""
@@ -312,6 +313,5 @@ class PieceCache:
             finally:
                 temporary.unlink(missing_ok=True)
         except OSError as error:
-            if self._writable:
+            if self._first_failure.acquire(blocking=False):
                 _logger.warning("divided meshes are not kept for the next time: %s", error)
-            self._writable = False
