@@ -9,7 +9,8 @@ from equirl.modules.encoder import EquivariantEncoder
 from equirl.modules.fields import FieldType
 from equirl.modules.filters import shared_filters
 from equirl.modules.methods import METHODS
-from equirl.modules.pooling import GroupMaxPool
+from equirl.modules.nonlinearity import FieldReLU, GatedNonlinearity
+from equirl.modules.pooling import FieldMaxPool, GroupMaxPool, NormMaxPool, NormPool
 from equirl.modules.steerable import SteerableConv, SteerableLinear
 
 __all__ = [
@@ -19,9 +20,14 @@ __all__ = [
     "EquivariantEncoder",
     "EquivariantPolicy",
     "EquivariantQHeads",
+    "FieldMaxPool",
+    "FieldReLU",
     "FieldType",
+    "GatedNonlinearity",
     "GroupMaxPool",
     "NativeUnavailable",
+    "NormMaxPool",
+    "NormPool",
     "RadialTanhNormal",
     "SteerableConv",
     "SteerableLinear",

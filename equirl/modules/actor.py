@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
@@ -12,8 +14,8 @@ from equirl.modules.distributions import RadialTanhNormal
 from equirl.modules.encoder import EquivariantEncoder
 from equirl.modules.fields import FieldType
 from equirl.modules.steerable import SteerableLinear
-from equirl.modules.wiring import as_actor
-from equirl.symmetry import SymmetryGroup, action_representation
+from equirl.modules.wiring import OBSERVATION_KEYS, as_actor, check_keys
+from equirl.symmetry import Representation, SymmetryGroup, action_representation
 
 __all__ = ["LOG_STD_RANGE", "EquivariantPolicy", "make_actor"]
 
@@ -25,16 +27,17 @@ class EquivariantPolicy(nn.Module):
     """Encoder and head: the Gaussian's mean, an action, and invariant standard deviations.
 
     Args:
-        encoder: Maps an observation to regular fields.
+        encoder: Maps an observation to hidden fields.
+        action: How the action transforms; None for the manipulation action of the mode.
         mode: ``"strict"``: the mean transforms like the physical action and each of its
             irreducible blocks has one standard deviation, so that x and y share theirs.
-            ``"paper"`` (appendix A): theta's mean is an invariant and each of the five
-            components has its own standard deviation.
+            ``"paper"`` (appendix A): theta's mean is an invariant and each component has its
+            own standard deviation.
         generator: Source of the head's initial weights; torch's global one if None.
 
     Attributes:
-        in_type: Two trivial fields, depth and flag.
-        out_rep: The action's representation in this mode, which the mean obeys.
+        in_type: The encoder's input fields.
+        out_rep: The action's representation, which the mean obeys.
         sharing: For each log standard deviation, how many components of the action it serves.
         distribution: What mean and deviations are the parameters of, besides
             ``distribution_options``.
@@ -44,12 +47,13 @@ class EquivariantPolicy(nn.Module):
         self,
         encoder: EquivariantEncoder,
         *,
+        action: Representation | None = None,
         mode: str = "strict",
         generator: torch.Generator | None = None,
     ):
         super().__init__()
         self.encoder = encoder
-        self.out_rep = action_representation(mode)
+        self.out_rep = action_representation(mode) if action is None else action
         self.sharing: tuple[int, ...]
         self.distribution: type[torch.distributions.Distribution]
         self.distribution_options: dict[str, Any]
@@ -66,9 +70,9 @@ class EquivariantPolicy(nn.Module):
         self.head = SteerableLinear(self.encoder.out_type, out_type, generator=generator)
         self.to(next(encoder.parameters()).device)
 
-    def forward(self, depth: Tensor, holding: Tensor) -> tuple[Tensor, Tensor]:
-        """Maps (*batch, 1, S, S) and (*batch, 1) to mean and deviation, both (*batch, 5)."""
-        out = self.head(self.encoder(depth, holding))
+    def forward(self, image: Tensor, invariants: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Maps an observation, see the encoder, to mean and deviation, both (*batch, dim)."""
+        out = self.head(self.encoder(image, invariants))
         loc, log_std = out.split([self.out_rep.dim, len(self.sharing)], -1)
         scale = log_std.clamp(*LOG_STD_RANGE).exp()
         shared = zip(scale.split(1, -1), self.sharing, strict=True)
@@ -81,6 +85,10 @@ def make_actor(
     hidden: int = 64,
     image_size: int = 128,
     mode: str = "strict",
+    action: Representation | None = None,
+    in_keys: Sequence[NestedKey] = OBSERVATION_KEYS,
+    channels: int = 1,
+    invariants: int = 1,
     backend: str = "auto",
     device: torch.device | str | None = None,
     generator: torch.Generator | None = None,
@@ -88,10 +96,12 @@ def make_actor(
     """An equivariant policy for soft actor-critic (paper, appendix A, figure 7 top).
 
     Reads ``depth`` (*batch, 1, S, S) and ``holding`` (*batch, 1); writes ``loc``, ``scale``,
-    ``action`` (each (*batch, 5)) and ``action_log_prob``.
+    ``action`` (each (*batch, 5)) and ``action_log_prob``. For another environment, name its
+    keys and state how its action transforms; `docs/custom_pipeline.md` does.
 
     Parameters at the paper's size (``strict`` shares one deviation between x and y, and
-    has no bias on theta where reflections change its sign):
+    has no bias on theta where reflections change its sign, nor weights to it in O(2)'s head
+    but from sign fields):
 
     =====  =========  =========
     group  strict     paper
@@ -100,15 +110,21 @@ def make_actor(
     C8     1,113,119  1,113,184
     D4     1,113,118  1,113,184
     D8     2,225,182  2,225,248
+    SO2    1,394,271  1,394,336
+    O2     1,047,438  1,047,504
     =====  =========  =========
 
     Args:
-        group: The symmetry group or its name: any ``C<n>`` or ``D<n>``.
-        hidden: Number of regular fields; 64 in the paper. A multiple of 8 (16 for 256 px).
+        group: The symmetry group or its name: any ``C<n>`` or ``D<n>``, ``SO2`` or ``O2``.
+        hidden: Number of hidden fields; 64 in the paper. A multiple of 8 (16 for 256 px).
         image_size: Side of the image: 16, 32, 64, 128 or 256 pixels.
         mode: ``"strict"``: the distribution is exactly equivariant under the physical
             action; x and y are squashed radially onto the unit disc. ``"paper"``: the
             published policy, an elementwise squashed Gaussian with theta an invariant.
+        action: How the action transforms; None for the manipulation action of the mode.
+        in_keys: Keys of the image and, if there are ``invariants``, of these.
+        channels: Channels of the image.
+        invariants: Length of the vector of invariants, 0 if there is none.
         backend: Of the encoder: ``"native"``, the kernels for CPUs; ``"dense"``, torch's own;
             ``"auto"``, the faster one. They differ by rounding only, and share parameters.
         device: Where the parameters live; ``"auto"`` for the first GPU if there is one.
@@ -120,13 +136,17 @@ def make_actor(
     Example:
         >>> actor = make_actor("D4", hidden=16, image_size=64)
     """
+    check_keys(in_keys, invariants)
     encoder = EquivariantEncoder(
         group,
         hidden=hidden,
         image_size=image_size,
+        channels=channels,
+        invariants=invariants,
+        mode=mode,
         backend=backend,
         device=device,
         generator=generator,
     )
-    policy = EquivariantPolicy(encoder, mode=mode, generator=generator)
-    return as_actor(policy, policy.distribution, **policy.distribution_options)
+    policy = EquivariantPolicy(encoder, action=action, mode=mode, generator=generator)
+    return as_actor(policy, policy.distribution, in_keys, **policy.distribution_options)

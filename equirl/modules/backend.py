@@ -49,8 +49,8 @@ def resolve_backend(
     if name == "dense":
         return "dense"
     if name == "auto":
-        return _faster_backend(group.name if group.rotations % 4 else None, str(device))
-    if group.rotations % 4:
+        return _faster_backend(None if group.has_quarter_turns else group.name, str(device))
+    if not group.has_quarter_turns:
         raise ValueError(
             f"backend={name!r} serves groups that contain the quarter turns, not {group.name}"
         )

@@ -17,7 +17,17 @@ import numpy as np
 import torch
 from torch.overrides import TorchFunctionMode
 
-from equirl.modules.fields import REGULAR, SIGN, TRIVIAL, VECTOR, VECTOR_X, VECTOR_Y
+from equirl.modules.coupling import fixed_couplings
+from equirl.modules.fields import (
+    REGULAR,
+    SIGN,
+    TRIVIAL,
+    VECTOR,
+    VECTOR_2,
+    VECTOR_3,
+    VECTOR_X,
+    VECTOR_Y,
+)
 from equirl.symmetry import SymmetryGroup
 
 with warnings.catch_warnings():
@@ -70,7 +80,7 @@ def kernel_basis(
     in_rep, out_rep = _representation(group, in_field), _representation(group, out_field)
     accept, rings, widths, max_frequency = compute_basis_params(kernel_size)
     try:
-        with _Float64(), torch.device("cpu"):
+        with _Float64(), torch.device("cpu"), fixed_couplings(in_rep.group):
             profile = kernels.GaussianRadialProfile(rings, widths)
             axis = 0.0 if group.reflections else math.pi / 2  # escnn's own choice for R2Conv
             basis = kernels.SteerableKernelBasis(
@@ -82,9 +92,9 @@ def kernel_basis(
             )
             points = torch.tensor(get_grid_coords(2, kernel_size, 1), dtype=torch.float64)
             sampled = basis.sample(points).permute(1, 2, 3, 0).numpy()
+            attributes = list(basis)
     except kernels.EmptyBasisException:
         return None
-    attributes = list(basis)
     elements = _normalise(sampled, [attribute["shape"][0] for attribute in attributes])
     # Frequencies a ring cannot resolve, and elements that vanish on the grid, are dropped.
     nonzero = (elements**2).sum((1, 2, 3)) > 1e-2
@@ -114,11 +124,12 @@ def _normalise(elements: np.ndarray, sizes: list[int]) -> np.ndarray:
 
 def _subgroup_id(group: SymmetryGroup) -> tuple[float | None, int]:
     # In O(2): the reflection across the image's vertical axis, which flips the columns.
-    return (math.pi if group.reflections else None), group.rotations
+    axis = math.pi if group.reflections else None
+    return axis, group.rotations if group.is_finite else -1
 
 
 def _representation(group: SymmetryGroup, field: str) -> Any:
-    fiber, _, _ = escnn_group.o2_group(1).subgroup(_subgroup_id(group))
+    fiber, _, _ = escnn_group.o2_group(6).subgroup(_subgroup_id(group))
     if field == REGULAR:
         return fiber.regular_representation
     irreps: dict[str, tuple[int, ...]]
@@ -127,11 +138,13 @@ def _representation(group: SymmetryGroup, field: str) -> Any:
             TRIVIAL: (0, 0),
             SIGN: (1, 0),
             VECTOR: (1, 1),
+            VECTOR_2: (1, 2),
+            VECTOR_3: (1, 3),
             VECTOR_X: (0, 1),
             VECTOR_Y: (1, 1),
         }
     else:
-        irreps = {TRIVIAL: (0,), VECTOR: (1,), VECTOR_X: (1,)}
+        irreps = {TRIVIAL: (0,), VECTOR: (1,), VECTOR_2: (2,), VECTOR_3: (3,), VECTOR_X: (1,)}
     return fiber.irrep(*irreps[field])
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from equirl.modules.bases import KernelBasis, field_label, kernel_basis
 from equirl.modules.fields import FieldType
 
-__all__ = ["Block", "field_blocks", "initial_weights"]
+__all__ = ["Block", "block_filters", "field_blocks", "initial_weights"]
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,34 @@ def field_blocks(
                 found.append((Block(into, out, *counts, len(basis)), basis))
     found.sort(key=lambda item: (field_label(group, item[0].into), field_label(group, item[0].out)))
     return dict(found)
+
+
+def block_filters(in_type: FieldType, out_type: FieldType, kernel_size: int) -> np.ndarray:
+    """The filter of each weight alone, in the order of the weights.
+
+    Returns:
+        Shape (weights, out size, in size, kernel_size ** 2), float64.
+    """
+    starts = [
+        np.cumsum([0, *(fields.dim(field) for field in fields.fields)])
+        for fields in (out_type, in_type)
+    ]
+    filters = []
+    for block, basis in field_blocks(in_type, out_type, kernel_size).items():
+        places = [
+            [start[i] for i, field in enumerate(fields.fields) if field == kind]
+            for fields, kind, start in zip(
+                (out_type, in_type), (block.out, block.into), starts, strict=True
+            )
+        ]
+        for out in places[0]:
+            for into in places[1]:
+                for element in basis.elements:
+                    filter = np.zeros((out_type.size, in_type.size, kernel_size**2))
+                    rows, columns, _ = element.shape
+                    filter[out : out + rows, into : into + columns] = element
+                    filters.append(filter)
+    return np.stack(filters)
 
 
 def initial_weights(

@@ -44,7 +44,7 @@ class CNNEncoder(nn.Module):
 
     def forward(self, depth: Tensor, holding: Tensor) -> Tensor:
         """Encodes (*batch, 1, S, S) and (*batch, 1) to (*batch, 2 * hidden)."""
-        x = stack_observation(depth, holding, self.image_size)
+        x = stack_observation(depth, holding, 1, 1, self.image_size)
         x = convolve(self.layers, self.pools, x)
         return x.reshape(*depth.shape[:-3], self.out_features)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,27 +17,51 @@ __all__ = [
     "SIGN",
     "TRIVIAL",
     "VECTOR",
+    "VECTOR_2",
+    "VECTOR_3",
     "VECTOR_X",
     "VECTOR_Y",
+    "Channels",
     "FieldType",
     "element_key",
 ]
 
-# Kinds of fields: regular ones, the irreps of O(2), and what a half turn leaves of a vector.
+# Kinds of fields: regular ones, the irreps of O(2) to frequency 3 (a vector of frequency k turns by
+# k times the angle), and what a half turn leaves of a vector.
 REGULAR = "regular"
 TRIVIAL, SIGN, VECTOR = Irrep.TRIVIAL.value, Irrep.SIGN.value, Irrep.VECTOR.value
+VECTOR_2, VECTOR_3 = "vector_2", "vector_3"
 VECTOR_X, VECTOR_Y = "vector_x", "vector_y"
+
+_FREQUENCIES = {VECTOR: 1, VECTOR_2: 2, VECTOR_3: 3}
+
+
+class Channels(NamedTuple):
+    """The channels of irreducible fields.
+
+    Args:
+        field_of: For each channel the index of its field.
+        first: For each field the index of its first channel.
+        second: For each field the index of its second channel; of its only one else.
+        has_second: For each field whether it has a second channel.
+    """
+
+    field_of: Tensor
+    first: Tensor
+    second: Tensor
+    has_second: Tensor
 
 
 @dataclass(frozen=True)
 class FieldType:
     """A stack of fields of one group, in the order of the channels.
 
-    A *regular* field has one channel per group element, permuted by the group; the
-    other fields are the blocks of a `Representation`,
-    restricted to the group. Where a restriction splits or merges blocks the fields
-    say so: a half turn acts on x and y alike, so for n = 2 a vector is two
-    one-dimensional fields, and without reflections a sign field is a trivial one.
+    A *regular* field of a finite group has one channel per group element, permuted by the
+    group; the other fields are irreducible: the blocks of a `Representation`, restricted to
+    the group, and for SO(2) and O(2) vectors of frequency 2 and 3. Where a restriction
+    splits or merges blocks the fields say so: a half turn acts on x and y alike, so for
+    n = 2 a vector is two one-dimensional fields, and without reflections a sign field is a
+    trivial one.
 
     Args:
         group: The symmetry group.
@@ -48,8 +73,20 @@ class FieldType:
 
     @classmethod
     def regular(cls, group: SymmetryGroup, count: int) -> FieldType:
-        """``count`` regular fields."""
+        """``count`` regular fields of a finite group."""
         return cls(group, (REGULAR,) * count)
+
+    @classmethod
+    def hidden(cls, group: SymmetryGroup, count: int) -> FieldType:
+        """``count`` times the field F that hidden layers are made of (appendix A).
+
+        The regular field of a finite group; of SO(2) and O(2) the irreps to frequency 3, side
+        by side: 7 channels, with O(2)'s sign field 8.
+        """
+        if group.is_finite:
+            return cls.regular(group, count)
+        signs = (SIGN,) if group.reflections else ()
+        return cls(group, (TRIVIAL, *signs, VECTOR, VECTOR_2, VECTOR_3) * count)
 
     @classmethod
     def trivial(cls, group: SymmetryGroup, count: int) -> FieldType:
@@ -61,7 +98,7 @@ class FieldType:
         """The blocks of a representation, restricted to the group."""
         fields: list[str] = []
         for irrep in representation.irreps:
-            if irrep is Irrep.VECTOR and group.rotations == 2:
+            if irrep is Irrep.VECTOR and group.is_finite and group.rotations == 2:
                 fields += [VECTOR_X, VECTOR_Y if group.reflections else VECTOR_X]
             elif irrep is Irrep.SIGN and not group.reflections:
                 fields.append(TRIVIAL)
@@ -83,7 +120,7 @@ class FieldType:
         """Number of channels of one field."""
         if field == REGULAR:
             return self.group.order
-        return 2 if field == VECTOR else 1
+        return 2 if field in _FREQUENCIES else 1
 
     @cached_property
     def size(self) -> int:
@@ -103,6 +140,24 @@ class FieldType:
     def is_regular(self) -> bool:
         """Whether every field is regular."""
         return all(field == REGULAR for field in self.fields)
+
+    @property
+    def is_permuted(self) -> bool:
+        """Whether the group permutes the channels, so that pointwise maps commute with it."""
+        return all(field in (REGULAR, TRIVIAL) for field in self.fields)
+
+    def channels(self) -> Channels:
+        """Which channels make up each irreducible field.
+
+        Raises:
+            ValueError: A field is regular.
+        """
+        if REGULAR in self.fields:
+            raise ValueError(f"expected irreducible fields, got {self}")
+        dims = torch.tensor([self.dim(field) for field in self.fields])
+        first = dims.cumsum(0) - dims
+        field_of = torch.arange(len(dims)).repeat_interleave(dims)
+        return Channels(field_of, first, first + (dims == 2), dims == 2)
 
     def bias_layout(self) -> tuple[list[int], list[float]]:
         """Which bias each channel receives, and its weight.
@@ -134,7 +189,9 @@ class FieldType:
         """
         if x.shape[-1] != self.size:
             raise ValueError(f"expected {self.size} channels for {self}, got {tuple(x.shape)}")
-        source = self._source_elements(element)
+        if element not in self.group:
+            raise ValueError(f"{element} is not an element of {self.group}")
+        source = self._source_elements(element) if REGULAR in self.fields else []
         parts, start = [], 0
         for field in self.fields:
             part = x[..., start : start + self.dim(field)]
@@ -151,13 +208,14 @@ class FieldType:
             return x * round(element.cos_sin[0])
         if field == VECTOR_Y:
             return x * round(element.cos_sin[0]) * (-1 if element.reflected else 1)
+        if field in _FREQUENCIES:
+            element = Element(element.angle * _FREQUENCIES[field], element.reflected)
+            return Representation(Irrep.VECTOR).transform(x, element)
         return Representation(field).transform(x, element)
 
     def _source_elements(self, element: Element) -> list[int]:
         # A regular field is a function on the group; g moves its value at h to g h.
         positions = {element_key(h): index for index, h in enumerate(self.group.elements)}
-        if element_key(element) not in positions:
-            raise ValueError(f"{element} is not an element of {self.group}")
         return [positions[element_key(element.inverse() @ h)] for h in self.group.elements]
 
     def __str__(self) -> str:

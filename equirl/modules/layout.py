@@ -87,27 +87,37 @@ def convolve(layers: Iterable[nn.Module], pools: Iterable[bool], x: Tensor) -> T
     return x
 
 
-def stack_observation(depth: Tensor, holding: Tensor, image_size: int) -> Tensor:
-    """The two channels a network sees: the depth image, and the holding flag tiled.
+def stack_observation(
+    image: Tensor, invariants: Tensor | None, channels: int, count: int, image_size: int
+) -> Tensor:
+    """What a network sees: the image's channels, and the invariants tiled.
 
     Args:
-        depth: Shape (*batch, 1, S, S), in metres, as the paper feeds it.
-        holding: Shape (*batch, 1), 0 or 1.
+        image: Shape (*batch, channels, S, S); a depth image in metres, as the paper feeds it.
+        invariants: Shape (*batch, count), such as the holding flag, 0 or 1; None if count is 0.
+        channels: Number of channels expected of the image.
+        count: Number of invariants expected.
         image_size: The S expected.
 
     Returns:
-        Shape (N, 2, S, S) with N the product of the batch dimensions, channels-last in
-        memory, the layout convolutions are fastest in.
+        Shape (N, channels + count, S, S) with N the product of the batch dimensions,
+        channels-last in memory, the layout convolutions are fastest in.
 
     Raises:
         ValueError: The shapes are not these.
     """
-    batch = depth.shape[:-3]
-    if depth.shape[-3:] != (1, image_size, image_size) or holding.shape != (*batch, 1):
+    batch = image.shape[:-3]
+    got = None if invariants is None else tuple(invariants.shape)
+    if image.shape[-3:] != (channels, image_size, image_size) or got != (
+        (*batch, count) if count else None
+    ):
+        also = f" and invariants (*batch, {count})" if count else " and no invariants"
         raise ValueError(
-            f"expected depth (*batch, 1, {image_size}, {image_size}) and holding (*batch, 1), "
-            f"got {tuple(depth.shape)} and {tuple(holding.shape)}"
+            f"expected an image (*batch, {channels}, {image_size}, {image_size}){also}, "
+            f"got {tuple(image.shape)} and {got}"
         )
-    depth = depth.reshape(math.prod(batch), image_size, image_size)
-    flag = holding.to(depth.dtype).reshape(-1, 1, 1).expand_as(depth)
-    return torch.stack([depth, flag], -1).permute(0, 3, 1, 2)
+    image = image.reshape(math.prod(batch), channels, image_size, image_size).movedim(1, -1)
+    if invariants is None:
+        return image.contiguous().movedim(-1, 1)
+    tiled = invariants.to(image.dtype).reshape(-1, 1, 1, count)
+    return torch.cat([image, tiled.expand(*image.shape[:-1], count)], -1).movedim(-1, 1)

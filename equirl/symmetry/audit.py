@@ -128,7 +128,7 @@ def audit_env(
     return EnvAudit(
         group=group,
         elements=elements,
-        left_out=tuple(g for g in group.elements if not g.preserves_grid),
+        left_out=tuple(g for g in group.some_elements() if not g.preserves_grid),
         environments=tuple(environments),
         unreflectable={index: names for index, names in enumerate(chiral) if names},
         actions=np.array([action for original in originals for action in original.actions]),

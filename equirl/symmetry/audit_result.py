@@ -257,9 +257,10 @@ class EnvAudit:
     def remarks(self) -> list[str]:
         """What the tables do not say, in sentences."""
         turns = sum(not element.reflected for element in self.elements)
+        left_out = len(self.left_out) if self.group.is_finite else "all other"
         remarks = [
             f"{self.group.name}: {turns} turns and {len(self.elements) - turns} reflections audited"
-            f", {len(self.left_out)} elements left out.",
+            f", {left_out} elements left out.",
             *(f"{name}: {self._told_apart(name)}." for name in self.environments),
             f"{self.clipped_targets:.0%} of the targets are clipped to the workspace. "
             f"{self.outside_disc:.0%} of the (x, y) actions lie outside the unit disc; a uniform "

@@ -3,7 +3,8 @@
 A group acts on the horizontal plane of the gripper. An element is a reflection
 ``y -> -y`` (or not) followed by a counter-clockwise rotation, from +x to +y. The
 finite groups of the paper (appendix A) are C_n, the rotations by multiples of
-``2 pi / n``, and D_n, the same rotations with the reflection.
+``2 pi / n``, and D_n, the same rotations with the reflection; the continuous ones are SO(2),
+all rotations, and O(2), the same with the reflection.
 """
 
 from __future__ import annotations
@@ -60,11 +61,15 @@ class Element:
 
 
 class SymmetryGroup:
-    """A finite group of rotations and reflections of the plane, ``C<n>`` or ``D<n>``.
+    """A group of rotations of the plane, with or without reflections.
 
     Args:
-        name: ``"C<n>"`` (n rotations) or ``"D<n>"`` (n rotations and n reflections)
-            with n from 2 to 1000, in either case.
+        name: In either case, ``"C<n>"`` (n rotations) or ``"D<n>"`` (n rotations and n
+            reflections) with n from 2 to 1000; ``"SO2"`` (all rotations) or ``"O2"`` (all
+            rotations and reflections).
+
+    Attributes:
+        reflections: Whether the group contains reflections.
 
     Raises:
         ValueError: The name is not such a group.
@@ -73,42 +78,98 @@ class SymmetryGroup:
         >>> group = SymmetryGroup("d4")
         >>> group.name, group.order, len(group.grid_elements)
         ('D4', 8, 8)
+        >>> group = SymmetryGroup("SO2")
+        >>> group.is_finite, len(group.grid_elements)
+        (False, 4)
     """
 
     def __init__(self, name: str | SymmetryGroup):
         if isinstance(name, SymmetryGroup):
             name = name.name
-        match = re.fullmatch(r"([CD])(\d+)", str(name).strip().upper())
-        if match is None or not 2 <= int(match[2]) <= _MOST_ROTATIONS:
+        text = str(name).strip().upper()
+        match = re.fullmatch(r"([CD])(\d+)", text)
+        if text in ("SO2", "O2"):
+            self._rotations, self.reflections = None, text == "O2"
+        elif match is not None and 2 <= int(match[2]) <= _MOST_ROTATIONS:
+            self._rotations, self.reflections = int(match[2]), match[1] == "D"
+        else:
             raise ValueError(
-                f"unknown symmetry group {name!r}: expected C<n> or D<n> with n from 2 to "
-                f"{_MOST_ROTATIONS}, for example C4, C8, D4 or D8 (the continuous SO2 and O2 are "
-                "not available yet)"
+                f"unknown symmetry group {name!r}: expected SO2, O2, or C<n> or D<n> with n from "
+                f"2 to {_MOST_ROTATIONS}, for example C4, C8, D4 or D8"
             )
-        self.rotations = int(match[2])
-        self.reflections = match[1] == "D"
 
     @property
     def name(self) -> str:
-        """``"C<n>"`` or ``"D<n>"``."""
-        return f"{'D' if self.reflections else 'C'}{self.rotations}"
+        """``"C<n>"``, ``"D<n>"``, ``"SO2"`` or ``"O2"``."""
+        if not self.is_finite:
+            return "O2" if self.reflections else "SO2"
+        return f"{'D' if self.reflections else 'C'}{self._rotations}"
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether the group is one of C_n and D_n; SO(2) and O(2) are continuous."""
+        return self._rotations is not None
+
+    @property
+    def rotations(self) -> int:
+        """Number of rotations of a finite group.
+
+        Raises:
+            ValueError: The group is continuous.
+        """
+        if self._rotations is None:
+            raise ValueError(f"{self.name} has infinitely many elements: take some of them")
+        return self._rotations
 
     @property
     def order(self) -> int:
-        """Number of elements."""
+        """Number of elements of a finite group.
+
+        Raises:
+            ValueError: The group is continuous.
+        """
         return self.rotations * (2 if self.reflections else 1)
 
     @property
     def elements(self) -> tuple[Element, ...]:
-        """All elements, rotations first, the identity at index 0."""
-        angles = [math.tau * k / self.rotations for k in range(self.rotations)]
+        """All elements of a finite group, rotations first, the identity at index 0.
+
+        Raises:
+            ValueError: The group is continuous; `some_elements` and `grid_elements` are not.
+        """
+        return self._with_rotations(self.rotations)
+
+    def some_elements(self, rotations: int = 32) -> tuple[Element, ...]:
+        """All elements of a finite group; of a continuous one those of a large finite subgroup.
+
+        Args:
+            rotations: Order of the rotations taken from a continuous group, at least 1.
+
+        Returns:
+            The elements, rotations first, the identity at index 0.
+        """
+        return self._with_rotations(rotations if self._rotations is None else self._rotations)
+
+    def _with_rotations(self, rotations: int) -> tuple[Element, ...]:
+        angles = [math.tau * k / rotations for k in range(rotations)]
         flips = (False, True) if self.reflections else (False,)
         return tuple(Element(angle, flip) for flip in flips for angle in angles)
 
     @property
+    def has_quarter_turns(self) -> bool:
+        """Whether the group contains the rotation by a right angle."""
+        return self._rotations is None or self._rotations % 4 == 0
+
+    @property
     def grid_elements(self) -> tuple[Element, ...]:
         """The elements shared with D4: they map a square pixel grid onto itself."""
-        return tuple(g for g in self.elements if g.preserves_grid)
+        return tuple(g for g in self.some_elements(4) if g.preserves_grid)
+
+    def __contains__(self, element: Element) -> bool:
+        if element.reflected and not self.reflections:
+            return False
+        turns = element.angle * (self._rotations or 0) / math.tau
+        return math.isclose(turns, round(turns), abs_tol=1e-9)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, SymmetryGroup) and self.name == other.name

@@ -1,20 +1,21 @@
-// Convolutions between fields of D4 or C4, at the cost the symmetry leaves.
+// Convolutions between fields of a group, at the cost the symmetry leaves.
 //
 // An equivariant 3 x 3 filter is a combination of six pixel functions: the centre, the
-// four edges with the corners, x^2 - y^2, xy, x and y. With a Fourier transform over each
-// field the contraction falls apart into one small matrix product per irreducible
-// representation. A layer is computed tile by tile, with everything in cache:
+// four edges with the corners, x^2 - y^2, xy, x and y. With the fields split into irreducible parts
+// (a Fourier transform of regular fields; those of SO(2) and O(2) are) the contraction falls
+// apart into one small matrix product per irreducible representation. A layer is computed tile
+// by tile, with everything in cache:
 //
-//   strip of the input -> Fourier transform -> six functions -> matrix products
-//         -> inverse transform, bias, 2 x 2 maximum, ReLU -> output
+//   strip of the input -> irreducible parts -> six functions -> matrix products
+//         -> bias, and either inverse transform, 2 x 2 maximum, ReLU or gates, pooling -> output
 //
 // The gradient of the input is the same computation with other weights; that of the
 // weights is a product of the two spectral tiles. Which row of a spectral tile holds what
-// is stated in spectral.py, which derives the weights from the dense filters.
+// is stated in rows.py; spectral.py derives the weights from the dense filters.
 //
 // Feature maps are stored as [batch / 16][field][row][column][channel of the field][16]:
 // sixteen images side by side, so that every operation is one on vectors and no width leaves
-// a remainder, and the channels that a Fourier transform needs next to one another. A few
+// a remainder, and the channels of a field next to one another. A few
 // images would leave those lanes empty: compiled with EQUIRL_ONE_IMAGE, the file gives the
 // forward pass for maps of one image, whose vectors run over the rows of the products.
 
@@ -22,16 +23,16 @@
 
 extern "C" {
 struct Layer {
-    int32_t order;       // of the group: 8 (D4) or 4 (C4)
-    int32_t regular;     // whether the input fields are regular (1) or trivial (0)
+    int32_t group;       // 0 to 3: C4, D4, SO(2), O(2)
+    int32_t hidden;      // whether the input fields are hidden ones (1) or trivial (0)
     int32_t fields_in;
-    int32_t fields_out;  // always regular
+    int32_t fields_out;  // always hidden
     int32_t height;      // of the input
     int32_t width;
     int32_t padding;     // 0 to 2
-    int32_t pool;        // 2 x 2 maximum; the convolution's height and width are even
-    int32_t relu;
-    float edge;          // weight of the corners in the function of edges and corners
+    int32_t pool;        // Pool; then the convolution's height and width are even
+    int32_t activation;  // of C4 and D4, a ReLU; the others always have their gates
+    float edge;          // weight of the corners in the functions of even frequency
     float axis;          // weight of the corners in the functions x and y
 };
 }
@@ -57,67 +58,66 @@ inline Sizes adjoint(const Sizes& s) {
             s.width_in,   2 - s.padding, s.edge,     s.axis};
 }
 
-/// Lays out a spectral tile of `rows` rows per irrep in memory; returns its size in floats.
-inline size_t lay_out(float* memory, int pixels, int singles, const int* single, int vector,
-                      Spectral* tile) {
+/// Calls `call` with an object of the group's type.
+template <class Call>
+void with_space(int group, const Call& call) {
+    switch (group) {
+        case 0: return call(Regular<false>{});
+        case 1: return call(Regular<true>{});
+        case 2: return call(Irreducible<false>{});
+        default: return call(Irreducible<true>{});
+    }
+}
+
+/// Lays out a spectral tile of some rows per irrep in memory; returns its size in floats.
+template <class Space>
+size_t lay_out(float* memory, int pixels, int fields, const int* rows, Spectral* tile) {
     constexpr int kSpare = 16;  // rows are read, or written, in whole groups
     tile->pixels = pixels;
     size_t used = 0;
-    for (int s = 0; s < singles; ++s) {
-        tile->single[s] = reinterpret_cast<Vec*>(memory) + used;
-        used += size_t(single[s] + kSpare) * tile->stride();
+    for (int r = 0; r < Space::irreps; ++r) {
+        tile->part[r] = reinterpret_cast<Vec*>(memory) + used;
+        used += size_t(fields * rows[r] + kSpare) * tile->stride(Space::dim[r]);
     }
-    tile->vector = reinterpret_cast<Vec*>(memory) + used;
-    used += size_t(vector + kSpare) * tile->stride2();
     return used * kLanes;
 }
 
-template <bool Mirror, bool Regular>
-size_t lay_out_input(float* memory, int pixels, int fields, Spectral* tile) {
-    using R = Rows<Mirror, Regular>;
-    int single[4];
-    for (int s = 0; s < 4; ++s) single[s] = fields * R::single[s];
-    return lay_out(memory, pixels, Group<Mirror>::singles, single, fields * R::vector, tile);
-}
-
-template <bool Mirror>
-size_t lay_out_output(float* memory, int pixels, int fields, Spectral* tile) {
-    const int single[4] = {fields, fields, fields, fields};
-    using G = Group<Mirror>;
-    return lay_out(memory, pixels, G::singles, single, G::copies * fields, tile);
-}
-
 /// The spectral input and output of a tile in this thread's memory.
-template <bool Mirror, bool Regular>
+template <class Space, class In, class Out>
 void lay_out_tiles(int pixels, int fields_in, int fields_out, Spectral* v, Spectral* o) {
-    const size_t in_size = lay_out_input<Mirror, Regular>(nullptr, pixels, fields_in, v);
-    const size_t out_size = lay_out_output<Mirror>(nullptr, pixels, fields_out, o);
+    const size_t in_size = lay_out<Space>(nullptr, pixels, fields_in, In::rows, v);
+    const size_t out_size = lay_out<Space>(nullptr, pixels, fields_out, Out::copies, o);
     float* memory = scratch<1>(in_size + out_size);
-    lay_out_input<Mirror, Regular>(memory, pixels, fields_in, v);
-    lay_out_output<Mirror>(memory + in_size, pixels, fields_out, o);
+    lay_out<Space>(memory, pixels, fields_in, In::rows, v);
+    lay_out<Space>(memory + in_size, pixels, fields_out, Out::copies, o);
 }
 
 /// Input fields that are transformed at a time, so that they stay in cache.
-template <bool Mirror, bool Regular>
+template <class Space, class In>
 int fields_at_once(int fields, int pixels, size_t bytes) {
-    const size_t one = size_t(Regular ? 6 * Group<Mirror>::order : 6) * pixels * sizeof(Vec);
-    int count = int(bytes / one) & ~3;  // whole groups of rows, for correlate()
+    size_t values = 0;
+    for (int r = 0; r < Space::irreps; ++r) values += In::rows[r] * Space::dim[r];
+    int count = int(bytes / (values * pixels * sizeof(Vec))) & ~3;  // whole groups, for correlate()
     if (count < 4) count = 4;
     return count < fields ? count : fields;
 }
 
-/// Weights [fields out][fields in][...] to the order in which multiply() reads them.
-template <bool Mirror, bool Regular>
-void pack(const Sizes& s, const float* weights, float* packed, const float** single,
-          const float** vector) {
-    using R = Rows<Mirror, Regular>;
-    using G = Group<Mirror>;
-    int size = G::copies * R::vector;
-    for (int c = 0; c < G::singles; ++c) size += R::single[c];
+/// Number of weights of a pair of fields.
+template <class Space, class In, class Out>
+constexpr int pair_size() {
+    int size = 0;
+    for (int r = 0; r < Space::irreps; ++r) size += Out::copies[r] * In::rows[r];
+    return size;
+}
+
+/// Weights [fields out][fields in][irrep][copy][row] to the order in which multiply() reads them.
+template <class Space, class In, class Out>
+void pack(const Sizes& s, const float* weights, float* packed, const float** starts) {
+    constexpr int size = pair_size<Space, In, Out>();
     const int ci = s.fields_in, co = s.fields_out;
-    // Rows of one irrep: copy c of output field o is row c * co + o.
-    const auto irrep = [&](int offset, int rows, int copies) {
-        const int m = copies * co, K = ci * rows;
+    for (int r = 0, offset = 0; r < Space::irreps; offset += Out::copies[r] * In::rows[r], ++r) {
+        // Copy c of output field o is row c * co + o.
+        const int rows = In::rows[r], m = Out::copies[r] * co, K = ci * rows;
         for (int i = 0, height; i < m; i += height) {
             height = height_of(m - i);
             for (int h = 0; h < height; ++h) {
@@ -125,65 +125,55 @@ void pack(const Sizes& s, const float* weights, float* packed, const float** sin
                 const float* from = weights + size_t(o) * ci * size + offset + c * rows;
                 float* to = packed + size_t(i) * K + h;
                 for (int f = 0; f < ci; ++f, from += size)
-                    for (int r = 0; r < rows; ++r)
-                        to[(size_t(f) * rows + r) * height] = i + h < m ? from[r] : 0;
+                    for (int k = 0; k < rows; ++k)
+                        to[(size_t(f) * rows + k) * height] = i + h < m ? from[k] : 0;
             }
         }
-        const float* start = packed;
+        starts[r] = packed;
         packed += size_t(padded(m)) * K;
-        return start;
-    };
-    int offset = 0;
-    for (int c = 0; c < G::singles; offset += R::single[c], ++c)
-        single[c] = irrep(offset, R::single[c], 1);
-    *vector = irrep(offset, R::vector, G::copies);
+    }
 }
 
 /// What becomes of the result of a convolution.
 struct Target {
     float* map;
     uint8_t* choice;    // of the maximum, 0 to 3, or 4 where the ReLU blocked; may be null
-    const float* bias;  // one per field, or null
-    bool pool, relu;
+    float* raw;         // fields and gates before they are multiplied; may be null
+    const float* bias;  // [copy of the trivial part][field], or null
+    int pool;
+    bool activation;
 };
 
-/// Inverse transform, bias, maximum and ReLU of a tile.
-template <bool Mirror>
-void finish(const Target& target, const Sizes& s, const Tile& tile, const Spectral& o) {
-    using G = Group<Mirror>;
-    const Steps single = steps_of(s.fields_out, o.stride());
-    const Steps vector = steps_of(G::copies * s.fields_out, o.stride2());
+/// Bias, pooling and activation of a tile of regular fields, or of irreducible ones as they are.
+template <class Space, class Out>
+void finish_plain(const Target& target, const Sizes& s, const Tile& tile, const Spectral& o,
+                  const Steps* steps) {
     const int shift = target.pool ? 1 : 0;
-    const Map<G::order> map = {s.height_out >> shift, s.width_out >> shift};
+    const Map<Out::channels> map = {s.height_out >> shift, s.width_out >> shift};
     const auto field_at = [&](int f, int pixel, Vec* values) {
-        Vec parts[G::order];
-        for (int c = 0; c < G::singles; ++c)
-            parts[c] = o.single[c][f * single.row + pixel * single.pixel];
+        Vec parts[Out::channels];
+        parts_at<Space, Out>(o, steps, s.fields_out, f, pixel, parts);
         if (target.bias) parts[0] += target.bias[f];
-        for (int c = 0; c < G::copies; ++c) {
-            const Vec* row = o.vector + (c * s.fields_out + f) * vector.row + pixel * vector.pixel;
-            parts[G::singles + 2 * c] = row[0];
-            parts[G::singles + 2 * c + 1] = row[o.pixels * vector.pixel];
-        }
-        inverse<Mirror>(parts, values);
+        Space::inverse(parts, values);
     };
     for (int f = 0; f < s.fields_out; ++f)
         for (int i = 0; i < tile.rows >> shift; ++i)
             for (int j = 0; j < tile.columns >> shift; ++j) {
                 const size_t k = map.at(f, (tile.row >> shift) + i, (tile.column >> shift) + j);
                 if (!target.pool) {
-                    Vec values[G::order];
+                    Vec values[Out::channels];
                     field_at(f, i * tile.columns + j, values);
-                    for (int c = 0; c < G::order; ++c) {
-                        const Vec v = target.relu ? keep(~mask(values[c] < 0), values[c]) : values[c];
-                        store(target.map + k + c * kBlock, v);
+                    for (int c = 0; c < Out::channels; ++c) {
+                        const Vec v = values[c];
+                        store(target.map + k + c * kBlock,
+                              target.activation ? keep(~mask(v < 0), v) : v);
                     }
                     continue;
                 }
-                Vec values[4][G::order];
+                Vec values[4][Out::channels];
                 for (int q = 0; q < 4; ++q)
                     field_at(f, (2 * i + q / 2) * tile.columns + 2 * j + q % 2, values[q]);
-                for (int c = 0; c < G::order; ++c) {
+                for (int c = 0; c < Out::channels; ++c) {
                     Vec best = values[0][c];
                     Mask choice = {};
                     for (int q = 1; q < 4; ++q) {
@@ -192,7 +182,7 @@ void finish(const Target& target, const Sizes& s, const Tile& tile, const Spectr
                         best = better ? v : best;
                         choice = better ? choice - choice + q : choice;
                     }
-                    if (target.relu) {
+                    if (target.activation) {
                         const Mask dead = mask(best <= 0);
                         best = keep(~dead, best);
                         choice = dead ? choice - choice + 4 : choice;
@@ -203,27 +193,65 @@ void finish(const Target& target, const Sizes& s, const Tile& tile, const Spectr
             }
 }
 
+/// Bias, gates and pooling of a tile of irreducible fields.
+template <bool Mirror>
+void finish_gated(const Target& target, const Sizes& s, const Tile& tile, const Spectral& o,
+                  const Steps* steps) {
+    using Space = Irreducible<Mirror>;
+    using Out = typename Space::Output;
+    using Field = Gated<Mirror>;
+    const int shift = target.pool ? 1 : 0;
+    const Map<Field::channels> map = {s.height_out >> shift, s.width_out >> shift};
+    const Map<Field::raw> raw = {s.height_out, s.width_out};
+    const auto field_at = [&](int f, int i, int j, Vec* values) {
+        Vec parts[Out::channels];
+        parts_at<Space, Out>(o, steps, s.fields_out, f, i * tile.columns + j, parts);
+        for (int c = 0; c < Out::trivials; ++c) parts[c] += target.bias[c * s.fields_out + f];
+        const Field field = Field::of(parts);
+        if (target.raw) field.write(target.raw + raw.at(f, tile.row + i, tile.column + j));
+        field.values(values);
+    };
+    for (int f = 0; f < s.fields_out; ++f)
+        for (int i = 0; i < tile.rows >> shift; ++i)
+            for (int j = 0; j < tile.columns >> shift; ++j) {
+                Vec values[4][Field::channels], pooled[Field::channels];
+                if (target.pool) {
+                    for (int q = 0; q < 4; ++q) field_at(f, 2 * i + q / 2, 2 * j + q % 2, values[q]);
+                    pool_vectors<Mirror>(target.pool, values, pooled);
+                } else {
+                    field_at(f, i, j, pooled);
+                }
+                const size_t k = map.at(f, (tile.row >> shift) + i, (tile.column >> shift) + j);
+                for (int c = 0; c < Field::channels; ++c) store(target.map + k + c * kBlock, pooled[c]);
+            }
+}
+
 constexpr size_t kCache = 400 << 10;  // bytes of spectral input at a time: within a 1 MB L2 cache
 
 /// Convolves every block. `source` and `target` give the maps of a block and split.
-template <bool Mirror, bool Regular, class MakeSource, class MakeTarget>
+template <class Space, class In, class Out, class MakeSource, class MakeTarget>
 void convolve(const Sizes& s, int blocks, const float* weights, int threads,
               const MakeSource& source_of, const MakeTarget& target_of) {
-    using G = Group<Mirror>;
-    using R = Rows<Mirror, Regular>;
-    const size_t count = size_t(s.fields_in) * padded(s.fields_out) * 6 * G::order;
-    float* packed = scratch<0>(count);
-    const float *single[4], *vector;
-    pack<Mirror, Regular>(s, weights, packed, single, &vector);
-
+    constexpr int irreps = Space::irreps;
+    size_t count = 0;
+    Steps steps[irreps];
     const Tile shape = tile_of(s.height_out, s.width_out);
     const int n = shape.pixels();
+    for (int r = 0; r < irreps; ++r) {
+        const int m = Out::copies[r] * s.fields_out;
+        count += size_t(s.fields_in) * In::rows[r] * padded(m);
+        steps[r] = steps_of(m, Spectral{{}, n}.stride(Space::dim[r]));
+    }
+    float* packed = scratch<0>(count);
+    const float* starts[irreps];
+    pack<Space, In, Out>(s, weights, packed, starts);
+
     const int strips = s.height_out / shape.rows, items = blocks * kSplits * strips;
-    const int chunk = fields_at_once<Mirror, Regular>(s.fields_in, n, kCache);
+    const int chunk = fields_at_once<Space, In>(s.fields_in, n, kCache);
 #pragma omp parallel for schedule(static) num_threads(threads)
     for (int item = 0; item < items; ++item) {
         Spectral v, o;
-        lay_out_tiles<Mirror, Regular>(n, chunk, s.fields_out, &v, &o);
+        lay_out_tiles<Space, In, Out>(n, chunk, s.fields_out, &v, &o);
         const int block = item / strips;
         const auto source = source_of(block / kSplits, block % kSplits);
         const Target target = target_of(block / kSplits, block % kSplits);
@@ -232,17 +260,18 @@ void convolve(const Sizes& s, int blocks, const float* weights, int threads,
         for (; tile.column < s.width_out; tile.column += shape.columns) {
             for (int f = 0; f < s.fields_in; f += chunk) {
                 const int fields = f + chunk < s.fields_in ? chunk : s.fields_in - f;
-                spectral_input<Mirror, Regular>(source, tile, s.padding, s.edge, s.axis, f,
-                                                fields, v);
-                for (int c = 0; c < G::singles; ++c)
-                    multiply(s.fields_out, n, fields * R::single[c], f * R::single[c],
-                             s.fields_in * R::single[c], single[c], v.single[c], v.stride(),
-                             o.single[c], f > 0);
-                multiply(G::copies * s.fields_out, 2 * n, fields * R::vector, f * R::vector,
-                         s.fields_in * R::vector, vector, v.vector, v.stride2(), o.vector,
-                         f > 0);
+                spectral_input<Space, In>(source, tile, s.padding, s.edge, s.axis, f, fields, v);
+                for (int r = 0; r < irreps; ++r) {
+                    const int rows = In::rows[r], dim = Space::dim[r];
+                    multiply(Out::copies[r] * s.fields_out, dim * n, fields * rows, f * rows,
+                             s.fields_in * rows, starts[r], v.part[r], v.stride(dim), o.part[r],
+                             f > 0);
+                }
             }
-            finish<Mirror>(target, s, tile, o);
+            if constexpr (Space::gated && Out::channels == Space::Output::channels)
+                finish_gated<Space::mirror>(target, s, tile, o, steps);
+            else
+                finish_plain<Space, Out>(target, s, tile, o, steps);
         }
     }
 }
@@ -252,32 +281,29 @@ inline int groups(int rows) { return (rows + 3) / 4; }
 
 /// Gradients of the weights and the bias. Work is divided into at most eight parts, whatever
 /// the number of threads, and summed in order: the result does not depend on that number.
-template <bool Mirror, bool Regular, class MakeSource, class MakeGradient>
+template <class Space, class In, class Out, class MakeSource, class MakeGradient>
 void correlate_maps(const Sizes& s, int blocks, float* weights, float* bias, int threads,
                     const MakeSource& source_of, const MakeGradient& gradient_of) {
-    using G = Group<Mirror>;
-    using R = Rows<Mirror, Regular>;
-    const int ci = s.fields_in, co = s.fields_out;
+    constexpr int irreps = Space::irreps;
+    const int ci = s.fields_in, co = s.fields_out, biases = Out::copies[0] * co;
     const Tile shape = tile_of(s.height_out, s.width_out);
     const int n = shape.pixels(), strips = s.height_out / shape.rows;
     const int items = blocks * kSplits * strips, parts = items < 8 ? items : 8;
-    const int chunk = fields_at_once<Mirror, Regular>(ci, n, kCache);
+    const int chunk = fields_at_once<Space, In>(ci, n, kCache);
 
-    size_t offset[5], size = 0;  // of each irrep's sums, then the bias
-    for (int c = 0; c < G::singles; ++c) {
-        offset[c] = size;
-        size += size_t(groups(co)) * groups(ci * R::single[c]) * 16;
+    size_t offset[irreps], size = 0;  // of each irrep's sums, then the bias
+    for (int r = 0; r < irreps; ++r) {
+        offset[r] = size;
+        size += size_t(groups(Out::copies[r] * co)) * groups(ci * In::rows[r]) * 16;
     }
-    offset[4] = size;
-    size += size_t(groups(G::copies * co)) * groups(ci * R::vector) * 16;
     const size_t shift = size;
-    size = (size + co + 15) & ~size_t(15);
+    size = (size + biases + 15) & ~size_t(15);
     float* sums = scratch<0>(size * parts);
 
 #pragma omp parallel for schedule(static, 1) num_threads(threads)
     for (int part = 0; part < parts; ++part) {
         Spectral v, o;
-        lay_out_tiles<Mirror, Regular>(n, chunk, co, &v, &o);
+        lay_out_tiles<Space, In, Out>(n, chunk, co, &v, &o);
         float* sum = sums + size * part;
         std::memset(sum, 0, size * sizeof(float));
         const int first = int(int64_t(items) * part / parts);
@@ -289,24 +315,21 @@ void correlate_maps(const Sizes& s, int blocks, float* weights, float* bias, int
             Tile tile = shape;
             tile.row = item % strips * shape.rows;
             for (; tile.column < s.width_out; tile.column += shape.columns) {
-                spectral_output<Mirror>(gradient, tile, co, o);
-                for (int f = 0; f < co; ++f) {
+                spectral_output<Space, Out>(gradient, tile, co, o);
+                for (int f = 0; f < biases; ++f) {
                     Vec total = {};
-                    for (int p = 0; p < n; ++p) total += o.single[0][f * o.stride() + p];
+                    for (int p = 0; p < n; ++p) total += o.part[0][f * o.stride(1) + p];
                     for (int l = 0; l < kLanes; ++l) sum[shift + f] += total[l];
                 }
                 for (int f = 0; f < ci; f += chunk) {
                     const int fields = f + chunk < ci ? chunk : ci - f;
-                    spectral_input<Mirror, Regular>(source, tile, s.padding, s.edge, s.axis, f,
-                                                    fields, v);
-                    for (int c = 0; c < G::singles; ++c)
-                        correlate(co, fields * R::single[c], n, o.single[c], o.stride(),
-                                  v.single[c], v.stride(),
-                                  sum + offset[c] + f * R::single[c] / 4 * 16,
-                                  groups(ci * R::single[c]));
-                    correlate(G::copies * co, fields * R::vector, 2 * n, o.vector, o.stride2(),
-                              v.vector, v.stride2(), sum + offset[4] + f * R::vector / 4 * 16,
-                              groups(ci * R::vector));
+                    spectral_input<Space, In>(source, tile, s.padding, s.edge, s.axis, f, fields, v);
+                    for (int r = 0; r < irreps; ++r) {
+                        const int rows = In::rows[r], dim = Space::dim[r];
+                        correlate(Out::copies[r] * co, fields * rows, dim * n, o.part[r],
+                                  o.stride(dim), v.part[r], v.stride(dim),
+                                  sum + offset[r] + f * rows / 4 * 16, groups(ci * rows));
+                    }
                 }
             }
         }
@@ -314,24 +337,20 @@ void correlate_maps(const Sizes& s, int blocks, float* weights, float* bias, int
 
     for (int part = 1; part < parts; ++part)
         for (size_t i = 0; i < size; ++i) sums[i] += sums[size * part + i];
-    for (int f = 0; f < co; ++f) bias[f] = sums[shift + f];
-    const auto irrep = [&](size_t from, int rows, int copy, float* to, int stride) {
-        for (int o = 0; o < co; ++o) {
-            const int i = copy * co + o;
-            const float* row = sums + from + (size_t(i / 4) * groups(ci * rows)) * 16 + i % 4 * 4;
-            for (int f = 0; f < ci; ++f)
-                for (int r = 0; r < rows; ++r) {
-                    const int j = f * rows + r;
-                    to[(size_t(o) * ci + f) * stride + r] = row[j / 4 * 16 + j % 4];
-                }
-        }
-    };
-    int stride = G::copies * R::vector, column = 0;
-    for (int c = 0; c < G::singles; ++c) stride += R::single[c];
-    for (int c = 0; c < G::singles; column += R::single[c], ++c)
-        irrep(offset[c], R::single[c], 0, weights + column, stride);
-    for (int c = 0; c < G::copies; ++c)
-        irrep(offset[4], R::vector, c, weights + column + c * R::vector, stride);
+    for (int f = 0; f < biases; ++f) bias[f] = sums[shift + f];
+    constexpr int stride = pair_size<Space, In, Out>();
+    for (int r = 0, column = 0; r < irreps; ++r) {
+        const int rows = In::rows[r];
+        for (int c = 0; c < Out::copies[r]; ++c, column += rows)
+            for (int o = 0; o < co; ++o) {
+                const int i = c * co + o;
+                const float* row =
+                    sums + offset[r] + (size_t(i / 4) * groups(ci * rows)) * 16 + i % 4 * 4;
+                float* to = weights + size_t(o) * ci * stride + column;
+                for (int j = 0; j < ci * rows; ++j)
+                    to[size_t(j / rows) * stride + j % rows] = row[j / 4 * 16 + j % 4];
+            }
+    }
 }
 
 #endif
@@ -342,89 +361,143 @@ size_t offset_of(const Map<Channels>& map, int fields, int block, int split) {
     return block * map.size(fields) + split * kLanes;
 }
 
-template <bool Mirror, bool Regular>
+template <class Space, class In>
 void forward(const Layer& layer, int blocks, const float* x, const float* weights,
-             const float* bias, float* y, uint8_t* choice, int threads) {
-    constexpr int order = Group<Mirror>::order;
+             const float* bias, float* y, uint8_t* choice, float* raw, int threads) {
+    using Out = typename Space::Output;
     const Sizes s = sizes_of(layer);
-    const Map<Regular ? order : 1> in = {s.height_in, s.width_in};
+    const Map<In::channels> in = {s.height_in, s.width_in};
     const int shift = layer.pool ? 1 : 0;
-    const Map<order> out = {s.height_out >> shift, s.width_out >> shift};
+    const Map<Space::Hidden::channels> out = {s.height_out >> shift, s.width_out >> shift};
+    const Map<Out::channels> all = {s.height_out, s.width_out};
     large_pages(y, blocks * out.size(s.fields_out) * sizeof(float));
     if (choice) large_pages(choice, blocks * out.size(s.fields_out));
-    convolve<Mirror, Regular>(
+    if (raw) large_pages(raw, blocks * all.size(s.fields_out) * sizeof(float));
+    convolve<Space, In, Out>(
         s, blocks, weights, threads,
         [&](int block, int split) {
-            return Plain<Regular ? order : 1>{in, x + offset_of(in, s.fields_in, block, split)};
+            return Plain<In::channels>{in, x + offset_of(in, s.fields_in, block, split)};
         },
         [&](int block, int split) {
             const size_t i = offset_of(out, s.fields_out, block, split);
-            uint8_t* chosen = choice ? choice + i : nullptr;
-            return Target{y + i, chosen, bias, layer.pool != 0, layer.relu != 0};
+            const size_t j = offset_of(all, s.fields_out, block, split);
+            return Target{y + i,      choice ? choice + i : nullptr, raw ? raw + j : nullptr,
+                          bias,       layer.pool,                    layer.activation != 0};
         });
 }
 
 inline void call_forward(const Layer& layer, int blocks, const float* x, const float* weights,
-                         const float* bias, float* y, uint8_t* choice, int threads) {
-    const auto d4 = layer.regular ? forward<true, true> : forward<true, false>;
-    const auto c4 = layer.regular ? forward<false, true> : forward<false, false>;
-    (layer.order == 8 ? d4 : c4)(layer, blocks, x, weights, bias, y, choice, threads);
+                         const float* bias, float* y, uint8_t* choice, float* raw, int threads) {
+    const auto call = [&](auto space) {
+        using Space = decltype(space);
+        const auto run = layer.hidden ? forward<Space, typename Space::Hidden>
+                                      : forward<Space, typename Space::Trivial>;
+        run(layer, blocks, x, weights, bias, y, choice, raw, threads);
+    };
+    with_space(layer.group, call);
 }
 
 #if !defined(EQUIRL_ONE_IMAGE)
-/// Calls `with` with a function of block and split that gives the gradient before pool and ReLU.
-template <bool Mirror, class With>
+/// Calls `with` with a function of block and split that gives the gradient before pool and
+/// activation: from that after them or, with gates, as unpool() has left it.
+template <class Space, class With>
 void with_gradient(const Layer& layer, const float* gradient, const float* y,
                    const uint8_t* choice, const With& with) {
-    constexpr int order = Group<Mirror>::order;
+    constexpr int channels = Space::Output::channels;
     const Sizes s = sizes_of(layer);
-    const int shift = layer.pool ? 1 : 0, fields = s.fields_out;
-    const Map<order> map = {s.height_out >> shift, s.width_out >> shift};
-    if (layer.pool)
-        with([=](int block, int split) {
-            const size_t i = offset_of(map, fields, block, split);
-            return Unpooled<order>{map, gradient + i, choice + i};
-        });
-    else if (layer.relu)
-        with([=](int block, int split) {
-            const size_t i = offset_of(map, fields, block, split);
-            return Masked<order>{map, gradient + i, y + i};
-        });
-    else
-        with([=](int block, int split) {
-            return Plain<order>{map, gradient + offset_of(map, fields, block, split)};
-        });
+    const int shift = layer.pool && !Space::gated ? 1 : 0, fields = s.fields_out;
+    const Map<channels> map = {s.height_out >> shift, s.width_out >> shift};
+    const auto plain = [=](int block, int split) {
+        return Plain<channels>{map, gradient + offset_of(map, fields, block, split)};
+    };
+    if constexpr (Space::gated) {
+        with(plain);
+    } else {
+        if (layer.pool)
+            with([=](int block, int split) {
+                const size_t i = offset_of(map, fields, block, split);
+                return Unpooled<channels>{map, gradient + i, choice + i};
+            });
+        else if (layer.activation)
+            with([=](int block, int split) {
+                const size_t i = offset_of(map, fields, block, split);
+                return Masked<channels>{map, gradient + i, y + i};
+            });
+        else
+            with(plain);
+    }
 }
 
-template <bool Mirror>
+template <class Space>
 void input_gradient(const Layer& layer, int blocks, const float* gradient, const float* y,
                     const uint8_t* choice, const float* weights, float* dx, int threads) {
+    using Hidden = typename Space::Hidden;
     const Sizes s = adjoint(sizes_of(layer));
-    const Map<Group<Mirror>::order> map = {s.height_out, s.width_out};
+    const Map<Hidden::channels> map = {s.height_out, s.width_out};
     large_pages(dx, blocks * map.size(s.fields_out) * sizeof(float));
-    with_gradient<Mirror>(layer, gradient, y, choice, [&](const auto& source_of) {
-        convolve<Mirror, true>(s, blocks, weights, threads, source_of, [&](int block, int split) {
+    with_gradient<Space>(layer, gradient, y, choice, [&](const auto& source_of) {
+        const auto target_of = [&](int block, int split) {
             float* start = dx + offset_of(map, s.fields_out, block, split);
-            return Target{start, nullptr, nullptr, false, false};
-        });
+            return Target{start, nullptr, nullptr, nullptr, kNone, false};
+        };
+        convolve<Space, typename Space::Output, Hidden>(s, blocks, weights, threads, source_of,
+                                                        target_of);
     });
 }
 
-template <bool Mirror, bool Regular>
+template <class Space, class In>
 void weight_gradient(const Layer& layer, int blocks, const float* x, const float* gradient,
                      const float* y, const uint8_t* choice, float* weights, float* bias,
                      int threads) {
     const Sizes s = sizes_of(layer);
-    constexpr int channels = Regular ? Group<Mirror>::order : 1;
-    const Map<channels> map = {s.height_in, s.width_in};
-    with_gradient<Mirror>(layer, gradient, y, choice, [&](const auto& gradient_of) {
-        correlate_maps<Mirror, Regular>(
+    const Map<In::channels> map = {s.height_in, s.width_in};
+    with_gradient<Space>(layer, gradient, y, choice, [&](const auto& gradient_of) {
+        correlate_maps<Space, In, typename Space::Output>(
             s, blocks, weights, bias, threads,
             [&](int block, int split) {
-                return Plain<channels>{map, x + offset_of(map, s.fields_in, block, split)};
+                return Plain<In::channels>{map, x + offset_of(map, s.fields_in, block, split)};
             },
             gradient_of);
     });
+}
+
+/// The gradient before gates and pooling, from that after them and the raw map.
+template <bool Mirror>
+void gate_gradient(const Layer& layer, int blocks, const float* raw, const float* gradient,
+                   float* before, int threads) {
+    using Field = Gated<Mirror>;
+    const Sizes s = sizes_of(layer);
+    const int shift = layer.pool ? 1 : 0, fields = s.fields_out;
+    const int height = s.height_out >> shift, width = s.width_out >> shift;
+    const Map<Field::channels> map = {height, width};
+    const Map<Field::raw> all = {s.height_out, s.width_out};
+    large_pages(before, blocks * all.size(fields) * sizeof(float));
+#pragma omp parallel for schedule(static) num_threads(threads)
+    for (int item = 0; item < blocks * kSplits * fields; ++item) {
+        const int field = item % fields, block = item / fields;
+        const float* from = raw + offset_of(all, fields, block / kSplits, block % kSplits);
+        float* to = before + offset_of(all, fields, block / kSplits, block % kSplits);
+        const float* dy = gradient + offset_of(map, fields, block / kSplits, block % kSplits);
+        for (int i = 0; i < height; ++i)
+            for (int j = 0; j < width; ++j) {
+                Vec pooled[Field::channels], result[Field::raw];
+                for (int c = 0; c < Field::channels; ++c)
+                    pooled[c] = load(dy + map.at(field, i, j) + c * kBlock);
+                Field four[4];
+                Vec values[4][Field::channels], slope[4][Field::channels];
+                size_t at[4];
+                for (int q = 0; q < (shift ? 4 : 1); ++q) {
+                    at[q] = all.at(field, (i << shift) + q / 2, (j << shift) + q % 2);
+                    four[q] = Field::read(from + at[q]);
+                    if (shift) four[q].values(values[q]);
+                }
+                if (shift) unpool_vectors<Mirror>(layer.pool, values, pooled, slope);
+                for (int q = 0; q < (shift ? 4 : 1); ++q) {
+                    four[q].backward(shift ? slope[q] : pooled, result);
+                    for (int c = 0; c < Field::raw; ++c) store(to + at[q] + c * kBlock, result[c]);
+                }
+            }
+    }
 }
 #endif
 
@@ -434,39 +507,51 @@ extern "C" {
 
 #if defined(EQUIRL_ONE_IMAGE)
 
-/// equirl_forward() for maps that hold one image each instead of sixteen; no choices.
+/// equirl_forward() for maps that hold one image each instead of sixteen; nothing is kept.
 void equirl_forward_one(const Layer* layer, int32_t images, const float* x, const float* weights,
                         const float* bias, float* y, int32_t threads) {
-    call_forward(*layer, images, x, weights, bias, y, nullptr, threads);
+    call_forward(*layer, images, x, weights, bias, y, nullptr, nullptr, threads);
 }
 
 #else
 
-/// Changes with the signatures below and with the order of the rows of spectral.py; compared
+/// Changes with the signatures below and with the order of the rows of rows.py; compared
 /// with the number in library.py.
-int32_t equirl_interface() { return 3; }
+int32_t equirl_interface() { return 4; }
 
-/// y = pool(relu(conv(x) + bias)); with `pool`, `choice` is written unless it is null.
+/// y = pool(activation(conv(x) + bias)). What the gradients need is written unless it is null:
+/// with C4 and D4 and `pool` to `choice`, with SO(2) and O(2) to `raw`, before the pooling.
 void equirl_forward(const Layer* layer, int32_t blocks, const float* x, const float* weights,
-                    const float* bias, float* y, uint8_t* choice, int32_t threads) {
-    call_forward(*layer, blocks, x, weights, bias, y, choice, threads);
+                    const float* bias, float* y, uint8_t* choice, float* raw, int32_t threads) {
+    call_forward(*layer, blocks, x, weights, bias, y, choice, raw, threads);
 }
 
-/// The gradient of x, for regular input; `weights` are those of the adjoint convolution.
+/// With SO(2) and O(2), the gradient `before` gates and pooling: the `gradient` of the next two.
+void equirl_gate_gradient(const Layer* layer, int32_t blocks, const float* raw,
+                          const float* gradient, float* before, int32_t threads) {
+    const auto call = layer->group == 3 ? gate_gradient<true> : gate_gradient<false>;
+    call(*layer, blocks, raw, gradient, before, threads);
+}
+
+/// The gradient of x, for hidden input; `weights` are those of the adjoint convolution.
 void equirl_input_gradient(const Layer* layer, int32_t blocks, const float* gradient,
                            const float* y, const uint8_t* choice, const float* weights, float* dx,
                            int32_t threads) {
-    const auto call = layer->order == 8 ? input_gradient<true> : input_gradient<false>;
-    call(*layer, blocks, gradient, y, choice, weights, dx, threads);
+    with_space(layer->group, [&](auto space) {
+        input_gradient<decltype(space)>(*layer, blocks, gradient, y, choice, weights, dx, threads);
+    });
 }
 
 /// The gradients of the weights and of the bias.
 void equirl_weight_gradient(const Layer* layer, int32_t blocks, const float* x,
                             const float* gradient, const float* y, const uint8_t* choice,
                             float* weights, float* bias, int32_t threads) {
-    const auto d4 = layer->regular ? weight_gradient<true, true> : weight_gradient<true, false>;
-    const auto c4 = layer->regular ? weight_gradient<false, true> : weight_gradient<false, false>;
-    (layer->order == 8 ? d4 : c4)(*layer, blocks, x, gradient, y, choice, weights, bias, threads);
+    with_space(layer->group, [&](auto space) {
+        using Space = decltype(space);
+        const auto run = layer->hidden ? weight_gradient<Space, typename Space::Hidden>
+                                       : weight_gradient<Space, typename Space::Trivial>;
+        run(*layer, blocks, x, gradient, y, choice, weights, bias, threads);
+    });
 }
 
 #endif

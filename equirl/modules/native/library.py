@@ -16,9 +16,9 @@ __all__ = ["Library", "NativeUnavailable", "best_instruction_set", "load"]
 #: What the kernels are compiled for, best first, and the file each is in.
 INSTRUCTION_SETS = {"AVX-512": "_avx512", "AVX2": "_avx2", "baseline": "_plain"}
 
-#: Number of the functions' signatures and of spectral.py's order of rows, the same as in
+#: Number of the functions' signatures and of rows.py's order of rows, the same as in
 #: the C++ sources: to be raised in both when either changes.
-INTERFACE = 3
+INTERFACE = 4
 
 
 class NativeUnavailable(RuntimeError):

@@ -2,7 +2,8 @@
 
 #pragma once
 
-#include "fields.hpp"
+#include "irreps.hpp"
+#include "regular.hpp"
 
 namespace {
 

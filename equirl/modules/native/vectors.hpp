@@ -76,6 +76,42 @@ inline Vec sums(Vec* v) {
 
 #endif
 
+#if defined(EQUIRL_ONE_IMAGE)
+inline Mask bits(Vec v) {
+    Mask m;
+    std::memcpy(&m, &v, sizeof m);
+    return m;
+}
+inline Vec from_bits(Mask m) {
+    Vec v;
+    std::memcpy(&v, &m, sizeof v);
+    return v;
+}
+#else
+inline Mask bits(Vec v) { return (Mask)v; }
+inline Vec from_bits(Mask m) { return (Vec)m; }
+#endif
+
+/// exp(x), to rounding; x is limited to where the result is a normal number.
+inline Vec exponential(Vec x) {
+    x = x > 87.0f ? Vec{} + 87.0f : x;
+    x = x < -87.0f ? Vec{} - 87.0f : x;
+    // x = k log 2 + r: the sum leaves the integer k in its lowest bits. log 2 comes in two parts,
+    // of which k times the first is exact; exp(r), |r| < 0.35, is its Taylor series.
+    constexpr float kInteger = 12582912.0f;  // 1.5 * 2^23, bits 0x4B400000
+    const Vec shifted = x * 1.44269504088896341f + kInteger, k = shifted - kInteger;
+    const Vec r = (x - k * 0.693359375f) + k * 2.12194440e-4f;
+    Vec p = r * (1.0f / 5040) + 1.0f / 720;
+    p = p * r + 1.0f / 120;
+    p = p * r + 1.0f / 24;
+    p = p * r + 1.0f / 6;
+    p = p * r + 0.5f;
+    p = p * r * r + r + 1.0f;
+    return p * from_bits((bits(shifted) - 0x4B400000 + 127) << 23);
+}
+
+inline Vec sigmoid(Vec x) { return 1.0f / (1.0f + exponential(-x)); }
+
 /// Memory that a thread keeps between calls; fresh pages cost more than the work on them.
 template <int Purpose>
 float* scratch(size_t floats) {

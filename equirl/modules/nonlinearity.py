@@ -1,0 +1,75 @@
+"""Activations that commute with a symmetry group."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from equirl.modules.constants import WithConstants
+from equirl.modules.fields import FieldType
+
+__all__ = ["FieldReLU", "GatedNonlinearity", "make_activation"]
+
+
+class FieldReLU(nn.Module):
+    """The ReLU of every channel, which commutes with permutations: for regular fields.
+
+    Args:
+        fields: Regular or trivial fields, of input and output.
+
+    Raises:
+        ValueError: A field is of another kind, whose channels a group mixes.
+    """
+
+    def __init__(self, fields: FieldType):
+        super().__init__()
+        if not fields.is_permuted:
+            raise ValueError(f"a ReLU commutes with regular and trivial fields, got {fields}")
+        self.in_type = self.out_type = fields
+
+    def forward(self, x: Tensor, dim: int = -1) -> Tensor:
+        """The ReLU of ``x``, computed in its memory; ``dim`` holds the channels."""
+        return F.relu(x, inplace=True)
+
+
+class GatedNonlinearity(WithConstants):
+    r"""Scales each field by an invariant gate: :math:`v\,\sigma(g + b)` (appendix A).
+
+    The input holds the fields and then one gate for each, whatever its dimension. The bias of
+    a gate adds to that of the layer before; escnn's module has it, so the paper's networks do.
+
+    Args:
+        fields: Fields of the output.
+
+    Attributes:
+        in_type: The fields, then as many trivial ones, the gates.
+        out_type: The fields.
+        bias: One for each gate, zero at first.
+    """
+
+    constant_names: ClassVar[tuple[str, ...]] = ("_field_of",)
+
+    def __init__(self, fields: FieldType):
+        super().__init__()
+        count = len(fields.fields)
+        self.in_type = fields + FieldType.trivial(fields.group, count)
+        self.out_type = fields
+        with torch.device("cpu"):
+            self.bias = nn.Parameter(torch.zeros(count))
+            self._field_of = fields.channels().field_of
+
+    def forward(self, x: Tensor, dim: int = -1) -> Tensor:
+        """Gates ``x``, of ``in_type.size`` channels in dimension ``dim``."""
+        values, gates = x.split([self.out_type.size, len(self.bias)], dim)
+        shape = [1] * x.ndim
+        shape[dim] = -1
+        gates = torch.sigmoid(gates + self.bias.view(shape))
+        return values * gates.index_select(dim, self._field_of)
+
+
+def make_activation(fields: FieldType) -> FieldReLU | GatedNonlinearity:
+    """The activation of hidden fields: a ReLU where the group permutes channels, else gates."""
+    return FieldReLU(fields) if fields.is_permuted else GatedNonlinearity(fields)
