@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -52,7 +51,7 @@ class Channels(NamedTuple):
     has_second: Tensor
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class FieldType:
     """A stack of fields of one group, in the order of the channels.
 
@@ -66,10 +65,24 @@ class FieldType:
     Args:
         group: The symmetry group.
         fields: One name per field. Use the constructors below instead.
+
+    Attributes:
+        size: Number of channels.
+        kinds: The different fields, in the order of their first appearance.
+
+    Raises:
+        ValueError: A field of a continuous group is regular.
     """
 
     group: SymmetryGroup
     fields: tuple[str, ...]
+    size: int = dataclasses.field(init=False, repr=False, compare=False)
+    kinds: tuple[str, ...] = dataclasses.field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        # Now, for torch.compile does not enter the lock of a cached property.
+        object.__setattr__(self, "kinds", tuple(dict.fromkeys(self.fields)))
+        object.__setattr__(self, "size", sum(self.dim(name) for name in self.fields))
 
     @classmethod
     def regular(cls, group: SymmetryGroup, count: int) -> FieldType:
@@ -121,16 +134,6 @@ class FieldType:
         if field == REGULAR:
             return self.group.order
         return 2 if field in _FREQUENCIES else 1
-
-    @cached_property
-    def size(self) -> int:
-        """Number of channels."""
-        return sum(self.dim(field) for field in self.fields)
-
-    @cached_property
-    def kinds(self) -> tuple[str, ...]:
-        """The different fields, in the order of their first appearance."""
-        return tuple(dict.fromkeys(self.fields))
 
     def kind_size(self, kind: str) -> int:
         """Number of channels of all fields of one kind."""

@@ -206,7 +206,9 @@ void spectral_output(const Source& source, const Tile& tile, int fields, const S
             Vec parts[Out::channels];
             Space::transform(Out{}, values, parts);
             const Vec* part = parts;
+#pragma GCC unroll 8
             for (int r = 0; r < Space::irreps; ++r)
+#pragma GCC unroll 8
                 for (int c = 0; c < Out::copies[r]; ++c) {
                     Vec* row = o.part[r] + size_t(c * fields + f) * o.stride(Space::dim[r]) + pixel;
                     for (int d = 0; d < Space::dim[r]; ++d) row[d * o.pixels] = *part++;
@@ -218,7 +220,9 @@ void spectral_output(const Source& source, const Tile& tile, int fields, const S
 template <class Space, class Out>
 inline void parts_at(const Spectral& o, const Steps* steps, int fields, int field, int pixel,
                      Vec* part) {
+#pragma GCC unroll 8
     for (int r = 0; r < Space::irreps; ++r)
+#pragma GCC unroll 8
         for (int c = 0; c < Out::copies[r]; ++c) {
             const Vec* row = o.part[r] + (c * fields + field) * steps[r].row + pixel * steps[r].pixel;
             for (int d = 0; d < Space::dim[r]; ++d) *part++ = row[d * o.pixels * steps[r].pixel];

@@ -203,10 +203,11 @@ inline void pool_vectors(int pool, const Vec (*v)[Gated<Mirror>::channels], Vec*
                 weight[q] = (norms[q][r] + kEpsilon) * (norms[q][r] + kEpsilon);
                 total += weight[q];
             }
+            const Vec inverse = 1.0f / total;
             for (int d = 0; d < Space::dim[r]; ++d, ++c) {
                 Vec sum = {};
                 for (int q = 0; q < 4; ++q) sum += weight[q] * v[q][c];
-                pooled[c] = sum / total;
+                pooled[c] = sum * inverse;
             }
         }
 }
@@ -241,8 +242,9 @@ inline void unpool_vectors(int pool, const Vec (*v)[Gated<Mirror>::channels], co
                 dot[q] = v[q][c] * gradient[c];
                 if (Space::dim[r] == 2) dot[q] += v[q][c + 1] * gradient[c + 1];
             }
+            const Vec inverse = 1.0f / total;
             for (int q = 0; q < 4; ++q) {
-                share[q] /= total;
+                share[q] *= inverse;
                 mean += share[q] * dot[q];
             }
             for (int q = 0; q < 4; ++q) {

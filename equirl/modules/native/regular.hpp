@@ -72,6 +72,7 @@ struct Regular {
             else
                 rows.both(vector, row, pixel, first, second);
         };
+#pragma GCC unroll 4
         for (int c = 0; c < (regular ? singles : 1); ++c) {
             // Multiplying by x^2 - y^2 or xy takes one irrep to another.
             const int square = Mirror ? c ^ 2 : c ^ 1, cross = Mirror ? c ^ 3 : c ^ 1;
@@ -91,6 +92,7 @@ struct Regular {
             }
         }
         if constexpr (regular)
+#pragma GCC unroll 2
             for (int c = 0; c < Hidden::copies[vector]; ++c)
                 for (int pixel = 0; pixel < pixels; ++pixel) {
                     const Six a = functions(singles + 2 * c, pixel);
