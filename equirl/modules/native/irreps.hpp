@@ -255,4 +255,37 @@ inline void unpool_vectors(int pool, const Vec (*v)[Gated<Mirror>::channels], co
         }
 }
 
+/// The gradient before gates and pooling, from that after them and the raw map.
+template <bool Mirror>
+struct Ungated {
+    using Field = Gated<Mirror>;
+    Map<Field::channels> map;  // after the pooling
+    Map<Field::raw> all;
+    const float *gradient, *raw;
+    int pool;
+    /// As the other sources, for tiles that lie within the map and divide no window.
+    template <class Use>
+    void each(int field, const Tile& tile, const Use& use) const {
+        const int step = pool ? 2 : 1;
+        for (int i = 0; i < tile.rows; i += step)
+            for (int j = 0; j < tile.columns; j += step) {
+                const int row = tile.row + i, column = tile.column + j;
+                Vec pooled[Field::channels], values[4][Field::channels], slope[4][Field::channels];
+                const float* from = gradient + map.at(field, row / step, column / step);
+                for (int c = 0; c < Field::channels; ++c) pooled[c] = load(from + c * kBlock);
+                Field fields[4];
+                for (int q = 0; q < step * step; ++q) {
+                    fields[q] = Field::read(raw + all.at(field, row + q / 2, column + q % 2));
+                    if (pool) fields[q].values(values[q]);
+                }
+                if (pool) unpool_vectors<Mirror>(pool, values, pooled, slope);
+                for (int q = 0; q < step * step; ++q) {
+                    Vec before[Field::raw];
+                    fields[q].backward(pool ? slope[q] : pooled, before);
+                    use((i + q / 2) * tile.columns + j + q % 2, before);
+                }
+            }
+    }
+};
+
 }  // namespace

@@ -19,7 +19,7 @@
 // images would leave those lanes empty: compiled with EQUIRL_ONE_IMAGE, the file gives the
 // forward pass for maps of one image, whose vectors run over the rows of the products.
 
-#include "products.hpp"
+#include "outputs.hpp"
 
 extern "C" {
 struct Layer {
@@ -38,13 +38,6 @@ struct Layer {
 }
 
 namespace {
-
-/// Sizes of one convolution.
-struct Sizes {
-    int fields_in, fields_out;
-    int height_in, width_in, height_out, width_out, padding;
-    float edge, axis;
-};
 
 inline Sizes sizes_of(const Layer& layer) {
     const int shrink = 2 - 2 * layer.padding;
@@ -132,98 +125,6 @@ void pack(const Sizes& s, const float* weights, float* packed, const float** sta
         starts[r] = packed;
         packed += size_t(padded(m)) * K;
     }
-}
-
-/// What becomes of the result of a convolution.
-struct Target {
-    float* map;
-    uint8_t* choice;    // of the maximum, 0 to 3, or 4 where the ReLU blocked; may be null
-    float* raw;         // fields and gates before they are multiplied; may be null
-    const float* bias;  // [copy of the trivial part][field], or null
-    int pool;
-    bool activation;
-};
-
-/// Bias, pooling and activation of a tile of regular fields, or of irreducible ones as they are.
-template <class Space, class Out>
-void finish_plain(const Target& target, const Sizes& s, const Tile& tile, const Spectral& o,
-                  const Steps* steps) {
-    const int shift = target.pool ? 1 : 0;
-    const Map<Out::channels> map = {s.height_out >> shift, s.width_out >> shift};
-    const auto field_at = [&](int f, int pixel, Vec* values) {
-        Vec parts[Out::channels];
-        parts_at<Space, Out>(o, steps, s.fields_out, f, pixel, parts);
-        if (target.bias) parts[0] += target.bias[f];
-        Space::inverse(parts, values);
-    };
-    for (int f = 0; f < s.fields_out; ++f)
-        for (int i = 0; i < tile.rows >> shift; ++i)
-            for (int j = 0; j < tile.columns >> shift; ++j) {
-                const size_t k = map.at(f, (tile.row >> shift) + i, (tile.column >> shift) + j);
-                if (!target.pool) {
-                    Vec values[Out::channels];
-                    field_at(f, i * tile.columns + j, values);
-                    for (int c = 0; c < Out::channels; ++c) {
-                        const Vec v = values[c];
-                        store(target.map + k + c * kBlock,
-                              target.activation ? keep(~mask(v < 0), v) : v);
-                    }
-                    continue;
-                }
-                Vec values[4][Out::channels];
-                for (int q = 0; q < 4; ++q)
-                    field_at(f, (2 * i + q / 2) * tile.columns + 2 * j + q % 2, values[q]);
-                for (int c = 0; c < Out::channels; ++c) {
-                    Vec best = values[0][c];
-                    Mask choice = {};
-                    for (int q = 1; q < 4; ++q) {
-                        const Vec v = values[q][c];
-                        const Mask better = mask((v > best) | (v != v));  // not a number wins
-                        best = better ? v : best;
-                        choice = better ? choice - choice + q : choice;
-                    }
-                    if (target.activation) {
-                        const Mask dead = mask(best <= 0);
-                        best = keep(~dead, best);
-                        choice = dead ? choice - choice + 4 : choice;
-                    }
-                    store(target.map + k + c * kBlock, best);
-                    if (target.choice) store_bytes(target.choice + k + c * kBlock, choice);
-                }
-            }
-}
-
-/// Bias, gates and pooling of a tile of irreducible fields.
-template <bool Mirror>
-void finish_gated(const Target& target, const Sizes& s, const Tile& tile, const Spectral& o,
-                  const Steps* steps) {
-    using Space = Irreducible<Mirror>;
-    using Out = typename Space::Output;
-    using Field = Gated<Mirror>;
-    const int shift = target.pool ? 1 : 0;
-    const Map<Field::channels> map = {s.height_out >> shift, s.width_out >> shift};
-    const Map<Field::raw> raw = {s.height_out, s.width_out};
-    const auto field_at = [&](int f, int i, int j, Vec* values) {
-        Vec parts[Out::channels];
-        parts_at<Space, Out>(o, steps, s.fields_out, f, i * tile.columns + j, parts);
-        for (int c = 0; c < Out::trivials; ++c) parts[c] += target.bias[c * s.fields_out + f];
-        const Field field = Field::of(parts);
-        if (target.raw) field.write(target.raw + raw.at(f, tile.row + i, tile.column + j));
-        field.values(values);
-    };
-    for (int f = 0; f < s.fields_out; ++f)
-        for (int i = 0; i < tile.rows >> shift; ++i)
-            for (int j = 0; j < tile.columns >> shift; ++j) {
-                Vec values[4][Field::channels], pooled[Field::channels];
-                if (target.pool) {
-                    for (int q = 0; q < 4; ++q) field_at(f, 2 * i + q / 2, 2 * j + q % 2, values[q]);
-                    pool_vectors<Mirror>(target.pool, values, pooled);
-                } else {
-                    field_at(f, i, j, pooled);
-                }
-                const size_t k = map.at(f, (tile.row >> shift) + i, (tile.column >> shift) + j);
-                for (int c = 0; c < Field::channels; ++c) store(target.map + k + c * kBlock, pooled[c]);
-            }
 }
 
 constexpr size_t kCache = 400 << 10;  // bytes of spectral input at a time: within a 1 MB L2 cache
@@ -398,8 +299,21 @@ inline void call_forward(const Layer& layer, int blocks, const float* x, const f
 }
 
 #if !defined(EQUIRL_ONE_IMAGE)
+/// A function of block and split that gives the gradient before gates and pooling.
+template <bool Mirror>
+auto ungated(const Layer& layer, const float* raw, const float* gradient) {
+    const Sizes s = sizes_of(layer);
+    const int shift = layer.pool ? 1 : 0, fields = s.fields_out, pool = layer.pool;
+    const Map<Gated<Mirror>::channels> map = {s.height_out >> shift, s.width_out >> shift};
+    const Map<Gated<Mirror>::raw> all = {s.height_out, s.width_out};
+    return [=](int block, int split) {
+        return Ungated<Mirror>{map, all, gradient + offset_of(map, fields, block, split),
+                               raw + offset_of(all, fields, block, split), pool};
+    };
+}
+
 /// Calls `with` with a function of block and split that gives the gradient before pool and
-/// activation: from that after them or, with gates, as unpool() has left it.
+/// activation: from that after them or, with gates, as gate_gradient() has left it.
 template <class Space, class With>
 void with_gradient(const Layer& layer, const float* gradient, const float* y,
                    const uint8_t* choice, const With& with) {
@@ -447,56 +361,41 @@ void input_gradient(const Layer& layer, int blocks, const float* gradient, const
 
 template <class Space, class In>
 void weight_gradient(const Layer& layer, int blocks, const float* x, const float* gradient,
-                     const float* y, const uint8_t* choice, float* weights, float* bias,
-                     int threads) {
+                     const float* y, const uint8_t* choice, const float* raw, float* weights,
+                     float* bias, int threads) {
     const Sizes s = sizes_of(layer);
     const Map<In::channels> map = {s.height_in, s.width_in};
-    with_gradient<Space>(layer, gradient, y, choice, [&](const auto& gradient_of) {
+    const auto run = [&](const auto& gradient_of) {
         correlate_maps<Space, In, typename Space::Output>(
             s, blocks, weights, bias, threads,
             [&](int block, int split) {
                 return Plain<In::channels>{map, x + offset_of(map, s.fields_in, block, split)};
             },
             gradient_of);
-    });
+    };
+    if constexpr (Space::gated)
+        if (raw) return run(ungated<Space::mirror>(layer, raw, gradient));
+    with_gradient<Space>(layer, gradient, y, choice, run);
 }
 
-/// The gradient before gates and pooling, from that after them and the raw map.
+/// Writes the gradient before gates and pooling, for the input's gradient to read around tiles.
 template <bool Mirror>
 void gate_gradient(const Layer& layer, int blocks, const float* raw, const float* gradient,
                    float* before, int threads) {
-    using Field = Gated<Mirror>;
     const Sizes s = sizes_of(layer);
-    const int shift = layer.pool ? 1 : 0, fields = s.fields_out;
-    const int height = s.height_out >> shift, width = s.width_out >> shift;
-    const Map<Field::channels> map = {height, width};
-    const Map<Field::raw> all = {s.height_out, s.width_out};
+    const int fields = s.fields_out;
+    const Map<Gated<Mirror>::raw> all = {s.height_out, s.width_out};
     large_pages(before, blocks * all.size(fields) * sizeof(float));
+    const auto source_of = ungated<Mirror>(layer, raw, gradient);
 #pragma omp parallel for schedule(static) num_threads(threads)
     for (int item = 0; item < blocks * kSplits * fields; ++item) {
         const int field = item % fields, block = item / fields;
-        const float* from = raw + offset_of(all, fields, block / kSplits, block % kSplits);
         float* to = before + offset_of(all, fields, block / kSplits, block % kSplits);
-        const float* dy = gradient + offset_of(map, fields, block / kSplits, block % kSplits);
-        for (int i = 0; i < height; ++i)
-            for (int j = 0; j < width; ++j) {
-                Vec pooled[Field::channels], result[Field::raw];
-                for (int c = 0; c < Field::channels; ++c)
-                    pooled[c] = load(dy + map.at(field, i, j) + c * kBlock);
-                Field four[4];
-                Vec values[4][Field::channels], slope[4][Field::channels];
-                size_t at[4];
-                for (int q = 0; q < (shift ? 4 : 1); ++q) {
-                    at[q] = all.at(field, (i << shift) + q / 2, (j << shift) + q % 2);
-                    four[q] = Field::read(from + at[q]);
-                    if (shift) four[q].values(values[q]);
-                }
-                if (shift) unpool_vectors<Mirror>(layer.pool, values, pooled, slope);
-                for (int q = 0; q < (shift ? 4 : 1); ++q) {
-                    four[q].backward(shift ? slope[q] : pooled, result);
-                    for (int c = 0; c < Field::raw; ++c) store(to + at[q] + c * kBlock, result[c]);
-                }
-            }
+        const auto source = source_of(block / kSplits, block % kSplits);
+        source.each(field, {0, 0, s.height_out, s.width_out}, [&](int pixel, const Vec* values) {
+            float* channel = to + all.at(field, 0, pixel);
+            for (int c = 0; c < Gated<Mirror>::raw; ++c) store(channel + c * kBlock, values[c]);
+        });
     }
 }
 #endif
@@ -517,7 +416,7 @@ void equirl_forward_one(const Layer* layer, int32_t images, const float* x, cons
 
 /// Changes with the signatures below and with the order of the rows of rows.py; compared
 /// with the number in library.py.
-int32_t equirl_interface() { return 4; }
+int32_t equirl_interface() { return 5; }
 
 /// y = pool(activation(conv(x) + bias)). What the gradients need is written unless it is null:
 /// with C4 and D4 and `pool` to `choice`, with SO(2) and O(2) to `raw`, before the pooling.
@@ -527,6 +426,7 @@ void equirl_forward(const Layer* layer, int32_t blocks, const float* x, const fl
 }
 
 /// With SO(2) and O(2), the gradient `before` gates and pooling: the `gradient` of the next two.
+/// Where that of the input is not wanted, the last takes the gradient after them and `raw`.
 void equirl_gate_gradient(const Layer* layer, int32_t blocks, const float* raw,
                           const float* gradient, float* before, int32_t threads) {
     const auto call = layer->group == 3 ? gate_gradient<true> : gate_gradient<false>;
@@ -545,12 +445,12 @@ void equirl_input_gradient(const Layer* layer, int32_t blocks, const float* grad
 /// The gradients of the weights and of the bias.
 void equirl_weight_gradient(const Layer* layer, int32_t blocks, const float* x,
                             const float* gradient, const float* y, const uint8_t* choice,
-                            float* weights, float* bias, int32_t threads) {
+                            const float* raw, float* weights, float* bias, int32_t threads) {
     with_space(layer->group, [&](auto space) {
         using Space = decltype(space);
         const auto run = layer->hidden ? weight_gradient<Space, typename Space::Hidden>
                                        : weight_gradient<Space, typename Space::Trivial>;
-        run(*layer, blocks, x, gradient, y, choice, weights, bias, threads);
+        run(*layer, blocks, x, gradient, y, choice, raw, weights, bias, threads);
     });
 }
 

@@ -105,7 +105,9 @@ def runs(layers: Iterable[nn.Module], x: Tensor) -> bool:
 
 
 def _parameters(layers: Iterable[nn.Module]) -> list[Tensor]:
-    return [p for layer in layers for p in layer._parameters.values() if p is not None]
+    # As attributes: tensors swapped in functionally need not be parameters.
+    found = (getattr(layer, name, None) for layer in layers for name in ("weights", "bias"))
+    return [tensor for tensor in found if tensor is not None]
 
 
 def _has_memory(tensor: Tensor) -> bool:
@@ -381,12 +383,12 @@ class _ConvBlock(torch.autograd.Function):
         x, weights, y, choice, raw = ctx.saved_tensors
         gradient = gradient.contiguous()
         layer, blocks, threads = ctypes.byref(ctx.layer), len(x), torch.get_num_threads()
-        if raw is not None:
+        if raw is not None and ctx.needs_input_grad[0]:
             before = torch.empty_like(raw)
             _functions().equirl_gate_gradient(
                 layer, blocks, raw.data_ptr(), gradient.data_ptr(), before.data_ptr(), threads
             )
-            gradient = before
+            gradient, raw = before, None
         common = gradient.data_ptr(), _address(y), _address(choice)
         dx = dw = db = None
         if ctx.needs_input_grad[0]:
@@ -398,7 +400,8 @@ class _ConvBlock(torch.autograd.Function):
             dw = torch.empty_like(weights)
             db = weights.new_empty(len(weights) * (1 + ctx.basis.space.gates))
             _functions().equirl_weight_gradient(
-                layer, blocks, x.data_ptr(), *common, dw.data_ptr(), db.data_ptr(), threads
+                *(layer, blocks, x.data_ptr(), *common, _address(raw)),
+                *(dw.data_ptr(), db.data_ptr(), threads),
             )
         return dx, dw, db, None, None, None, None
 
@@ -411,7 +414,7 @@ def _functions() -> ctypes.CDLL:
         ("equirl_forward", 6),
         ("equirl_gate_gradient", 3),
         ("equirl_input_gradient", 5),
-        ("equirl_weight_gradient", 6),
+        ("equirl_weight_gradient", 7),
     ):
         function = getattr(handle, name)
         function.restype = None
