@@ -5,20 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from equirl.analysis.pictures import COLOURS, pyplot, save
 from equirl.analysis.statistics import moving_return
 from equirl.analysis.tables import read_table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 __all__ = ["plot_run", "plot_runs"]
-
-_COLOURS = ("#0b6e99", "#d9730d", "#448361", "#9065b0", "#c14c8a")
 
 
 def plot_run(folder: Path, path: Path) -> None:
@@ -28,19 +26,19 @@ def plot_run(folder: Path, path: Path) -> None:
         folder: The run's folder, with ``metrics.csv`` and ``validation.csv``.
         path: The PNG file to write.
     """
-    plt = _pyplot()
+    plt = pyplot()
     metrics = read_table(folder / "metrics.csv")
     figure, axes = plt.subplots(2, 2, figsize=(9, 5.6), layout="constrained", sharex=True)
-    _draw_success(axes[0, 0], [folder], "validation", _COLOURS[0])
-    _draw_return(axes[0, 1], [folder], "behaviour policy", _COLOURS[1])
+    _draw_success(axes[0, 0], [folder], "validation", COLOURS[0])
+    _draw_return(axes[0, 1], [folder], "behaviour policy", COLOURS[1])
     if metrics:
         steps = metrics["step"]
-        axes[1, 0].plot(steps, metrics["loss_qvalue"], color=_COLOURS[2], lw=1)
+        axes[1, 0].plot(steps, metrics["loss_qvalue"], color=COLOURS[2], lw=1)
         scale = "log" if max(metrics["loss_qvalue"]) > 0 else "linear"  # 0 before any update
         axes[1, 0].set(title="critic loss", yscale=scale, xlabel="environment steps")
-        axes[1, 1].plot(steps, metrics["entropy"], color=_COLOURS[3], lw=1)
+        axes[1, 1].plot(steps, metrics["entropy"], color=COLOURS[3], lw=1)
         axes[1, 1].set(title="policy entropy (nats)", xlabel="environment steps")
-    _save(figure, path)
+    save(figure, path)
 
 
 def plot_runs(groups: Mapping[str, Sequence[Path]], path: Path, *, title: str = "") -> None:
@@ -52,15 +50,15 @@ def plot_runs(groups: Mapping[str, Sequence[Path]], path: Path, *, title: str = 
         path: The PNG file to write.
         title: Above the figure.
     """
-    plt = _pyplot()
+    plt = pyplot()
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
-    for colour, (label, folders) in zip(cycle(_COLOURS), groups.items(), strict=False):
+    for colour, (label, folders) in zip(cycle(COLOURS), groups.items(), strict=False):
         _draw_success(left, folders, label, colour)
         _draw_return(right, folders, label, colour)
     if left.get_legend_handles_labels()[0]:  # none without validations
         left.legend(frameon=False)
     figure.suptitle(title)
-    _save(figure, path)
+    save(figure, path)
 
 
 def _draw_success(axes: Axes, folders: Sequence[Path], label: str, colour: str) -> None:
@@ -87,18 +85,3 @@ def _draw_return(axes: Axes, folders: Sequence[Path], label: str, colour: str) -
             label = ""
     axes.set(title="discounted return, previous 500 steps", ylim=(-0.03, 1.03))
     axes.set_xlabel("environment steps")
-
-
-def _pyplot() -> Any:
-    import matplotlib
-
-    matplotlib.use("Agg")  # no display is needed
-    import matplotlib.pyplot as plt
-
-    plt.rcParams.update({"axes.spines.top": False, "axes.spines.right": False, "font.size": 9})
-    return plt
-
-
-def _save(figure: Figure, path: Path) -> None:
-    figure.savefig(path, dpi=110)
-    _pyplot().close(figure)

@@ -9,12 +9,22 @@ from equirl.config.reading import (
     to_config,
     write_atomically,
 )
-from equirl.config.schema import Config, EvaluateJob, TrainJob, WatchJob, is_free
+from equirl.config.schema import (
+    Config,
+    EvaluateJob,
+    ExportJob,
+    ReportJob,
+    TrainJob,
+    WatchJob,
+    is_free,
+)
 
 __all__ = [
     "Config",
     "ConfigError",
     "EvaluateJob",
+    "ExportJob",
+    "ReportJob",
     "TrainJob",
     "WatchJob",
     "explain",

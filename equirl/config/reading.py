@@ -18,7 +18,7 @@ from omegaconf.errors import (
 from yaml import YAMLError
 
 from equirl.config.declare import ConfigError, check_values, flatten
-from equirl.config.schema import Config, EvaluateJob, TrainJob, WatchJob
+from equirl.config.schema import Config, EvaluateJob, ExportJob, ReportJob, TrainJob, WatchJob
 
 __all__ = [
     "explain",
@@ -138,3 +138,5 @@ def register() -> None:
             OmegaConf.set_struct(node.demos.options, False)
         store.store(name=name, node=node)
     store.store(name="evaluate_schema", node=EvaluateJob)
+    store.store(name="export_schema", node=ExportJob)
+    store.store(name="report_schema", node=ReportJob)

@@ -21,9 +21,11 @@ __all__ = [
     "EnvConfig",
     "EvaluateJob",
     "EvaluationConfig",
+    "ExportJob",
     "LoggingConfig",
     "MethodConfig",
     "ReplayConfig",
+    "ReportJob",
     "TrainJob",
     "WatchJob",
     "is_free",
@@ -103,6 +105,7 @@ class EvaluationConfig:
     final_episodes: int = at_least(100, 1)  # test scenes after training
     discount: float = within(0.99, 0, 1)  # of the returns reported, the paper's
     video_episodes: int = at_least(3, 0)  # filmed after training; 0: no video
+    equivariance: bool = False  # of policy and critic, measured each time into symmetry.csv
 
 
 @dataclass
@@ -129,7 +132,7 @@ class Config:
     evaluation: EvaluationConfig = keys_of(EvaluationConfig, free=True)
     logging: LoggingConfig = keys_of(LoggingConfig, free=True)
     mode: str = one_of("strict", source=_MODES)  # the mathematics, independent of sizes
-    group: str = "D4"  # C<n> or D<n>, n from 2 to 1000
+    group: str = "D4"  # C<n> or D<n>, n from 2 to 1000, SO2 or O2
     steps: int = at_least(10_000, 1, free=True)  # environment steps, one update each
     checkpoint_every: int = at_least(500, 1, free=True)  # steps
     seed: int = at_least(0, 0)  # of networks, scenes, actions and replay
@@ -207,6 +210,59 @@ class EvaluateJob:
     backend: str = one_of("auto", source=_BACKENDS)
     video: str = ""  # MP4 file to film the first episodes into
     video_episodes: int = at_least(3, 1)
+
+
+@dataclass
+class ExportJob:
+    """What the command line of ``experiments/export.py`` takes."""
+
+    run: str = ""  # the folder of the run whose policy is exported
+    format: str = one_of("torch_export", "onnx")
+    output: str = ""  # a .pt2 or .onnx file; in the run's folder when empty
+    observations: int = at_least(64, 1)  # to measure on, half of them from the run's replay buffer
+    check: str = ""  # an exported file to measure again, and to compare with ``run`` if given
+
+    def validated(self) -> ExportJob:
+        """This job, if it says what to do.
+
+        Raises:
+            ConfigError: It does not.
+        """
+        if not self.run and not self.check:
+            raise ConfigError("run= is missing: expected the folder of a run, or check=FILE")
+        if self.check and self.output:
+            raise ConfigError(f"output={self.output}: leave it out, check={self.check} writes none")
+        return self
+
+
+@dataclass
+class ReportJob:
+    """What the command line of ``experiments/report.py`` takes."""
+
+    run: str = MISSING  # the folder of a run
+    group: str = ""  # whose elements are measured beside all angles; the run's own when empty
+    observations: int = at_least(64, 1)  # random ones, and as many from the run's replay buffer
+    angles: int = at_least(48, 1)  # turns measured, evenly spaced, beside those of the group
+    keep_theta: bool = False  # take theta for an invariant of reflections, as mode=paper does
+    seed: int = at_least(0, 0)  # of the random observations and of the actions
+    device: str = "auto"
+    backend: str = one_of("auto", source=_BACKENDS)
+    output: str = ""  # the folder of page, table and picture; the run's own when empty
+
+    def validated(self) -> ReportJob:
+        """This job, if its group exists.
+
+        Raises:
+            ConfigError: It does not.
+        """
+        from equirl.symmetry import SymmetryGroup
+
+        if self.group:
+            try:
+                SymmetryGroup(self.group)
+            except ValueError as error:
+                raise ConfigError(f"group={self.group}: {error}") from None
+        return self
 
 
 @dataclass

@@ -3,6 +3,9 @@
 from equirl.symmetry.audit import audit_env
 from equirl.symmetry.audit_result import EnvAudit
 from equirl.symmetry.groups import Element, SymmetryGroup
+from equirl.symmetry.report import equivariance_report
+from equirl.symmetry.report_observations import random_observations
+from equirl.symmetry.report_result import EquivarianceReport, error_table, layer_table
 from equirl.symmetry.representations import Irrep, Representation, ScalarField
 from equirl.symmetry.spec import (
     ACTION,
@@ -17,6 +20,7 @@ __all__ = [
     "ACTION_PAPER",
     "Element",
     "EnvAudit",
+    "EquivarianceReport",
     "Irrep",
     "Representation",
     "ScalarField",
@@ -24,5 +28,9 @@ __all__ = [
     "SymmetrySpec",
     "action_representation",
     "audit_env",
+    "equivariance_report",
+    "error_table",
+    "layer_table",
     "manipulation_spec",
+    "random_observations",
 ]

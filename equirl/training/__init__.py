@@ -2,9 +2,18 @@
 
 from equirl.training.checkpoint import CheckpointError, load_checkpoint
 from equirl.training.environment import describe_task, make_run_env, make_run_expert
+from equirl.training.equivariance import replay_observations
 from equirl.training.evaluation import Evaluation, evaluate
+from equirl.training.export import (
+    ExportError,
+    check_exported,
+    export_actor,
+    export_policy,
+    load_exported,
+    read_certificate,
+)
 from equirl.training.folder import CHECKPOINT, CONFIG, REPORT, FolderError, load_run_config
-from equirl.training.learner import Learner, load_policy
+from equirl.training.learner import Learner, load_learner, load_policy
 from equirl.training.loop import TrainingRun
 from equirl.training.networks import make_networks
 from equirl.training.seeding import Purpose, scene_seed
@@ -17,19 +26,27 @@ __all__ = [
     "REPORT",
     "CheckpointError",
     "Evaluation",
+    "ExportError",
     "FolderError",
     "Learner",
     "Purpose",
     "TrainingRun",
+    "check_exported",
     "describe_task",
     "evaluate",
+    "export_actor",
+    "export_policy",
     "film_policy",
     "load_checkpoint",
+    "load_exported",
+    "load_learner",
     "load_policy",
     "load_run_config",
     "make_networks",
     "make_run_env",
     "make_run_expert",
+    "read_certificate",
+    "replay_observations",
     "scene_seed",
     "train",
 ]

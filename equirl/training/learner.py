@@ -18,7 +18,7 @@ from equirl.training.checkpoint import CheckpointError, check_same_config, load_
 from equirl.training.folder import CHECKPOINT, load_run_config
 from equirl.training.networks import make_networks
 
-__all__ = ["Learner", "load_policy"]
+__all__ = ["Learner", "load_learner", "load_policy"]
 
 
 class Learner:
@@ -32,14 +32,18 @@ class Learner:
 
     Args:
         config: The run's configuration.
+
+    Attributes:
+        actor: The policy that collects experience; it shares its parameters with the loss.
+        critic: The critic, likewise; its target copy is the loss's own.
     """
 
     def __init__(self, config: Config):
         algorithm = config.algorithm
-        self.actor, critic = make_networks(config)
+        self.actor, self.critic = make_networks(config)
         self.loss = SACLoss(
             self.actor,
-            critic,
+            self.critic,
             alpha_init=algorithm.alpha,
             target_entropy=algorithm.target_entropy,
             gamma=algorithm.discount,
@@ -122,6 +126,24 @@ def load_policy(
         ConfigError: The folder is not that of a run, or the device or backend is not there.
         CheckpointError: It holds no readable checkpoint of that configuration.
     """
+    config, _, learner = load_learner(folder, device, backend)
+    return config, learner.policy
+
+
+def load_learner(
+    folder: str | Path, device: str | None = None, backend: str | None = None
+) -> tuple[Config, dict[str, Any], Learner]:
+    """What a run's folder holds: its configuration, its checkpoint, and the trained networks.
+
+    Args:
+        folder: The run's folder.
+        device: Where to put the networks; where they were trained when None.
+        backend: What equivariant encoders run on; what they were trained on when None.
+
+    Raises:
+        ConfigError: The folder is not that of a run, or the device or backend is not there.
+        CheckpointError: It holds no readable checkpoint of that configuration.
+    """
     folder = Path(folder)
     config = load_run_config(folder)
     config = replace(config, device=device or config.device, backend=backend or config.backend)
@@ -131,4 +153,4 @@ def load_policy(
     if "learner" not in state:
         raise CheckpointError(f"{folder / CHECKPOINT} lacks 'learner'")
     learner.load_state_dict(state["learner"])
-    return config, learner.policy
+    return config, state, learner

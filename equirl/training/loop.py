@@ -23,6 +23,7 @@ from equirl.training.checkpoint import (
     save_checkpoint,
 )
 from equirl.training.environment import make_run_env, make_run_expert
+from equirl.training.equivariance import replay_observations, symmetry_errors
 from equirl.training.evaluation import Evaluation, evaluate
 from equirl.training.folder import CHECKPOINT
 from equirl.training.learner import Learner
@@ -34,6 +35,10 @@ from equirl.training.timing import Stopwatch
 __all__ = ["TrainingRun"]
 
 _log = logging.getLogger("equirl")
+
+#: What the symmetry is measured on: so many of the first transitions, the demonstrations, which
+#: stay the same until the buffer is full.
+_OBSERVATIONS, _FIRST = 16, 64
 
 #: What the run's time is divided into.
 PARTS = ("demonstrations", "act", "environment", "replay", "update", "evaluation", "checkpoint")
@@ -68,12 +73,13 @@ class TrainingRun:
         self.learner = Learner(config)
         self.env = make_run_env(config)
         self.evaluation_env = make_run_env(config)
+        self.max_depth = self.env.observation_spec["depth"].high.max().item()
         self.generator = torch_generator(config.seed, Purpose.REPLAY)
         self.buffer = make_replay_buffer(
             config.replay.capacity,
             copies=config.copies,
             batch_size=config.algorithm.batch_size,
-            max_depth=self.env.observation_spec["depth"].high.max().item(),
+            max_depth=self.max_depth,
             device=config.torch_device,
             generator=self.generator,
         )
@@ -119,7 +125,8 @@ class TrainingRun:
         if not self._train():
             return None
         episodes = self.config.evaluation.final_episodes
-        outcome = self._evaluate(Purpose.TEST, episodes)
+        with self.clock.measure("evaluation"):
+            outcome = self._evaluate(Purpose.TEST, episodes)
         return outcome if len(outcome.episodes) == episodes else None
 
     def close(self) -> None:
@@ -194,7 +201,10 @@ class TrainingRun:
         self.log.write("metrics", row | self.averages.read())
 
     def _validate(self) -> None:
-        outcome = self._evaluate(Purpose.VALIDATION, self.config.evaluation.episodes)
+        with self.clock.measure("evaluation"):
+            outcome = self._evaluate(Purpose.VALIDATION, self.config.evaluation.episodes)
+            if self.config.evaluation.equivariance:
+                self._log_symmetry()
         self.progress.greedy = f"{outcome.success_rate:.0%}"
         low, high = outcome.interval
         row = {
@@ -215,7 +225,7 @@ class TrainingRun:
         seeds = (scene_seed(self.config.seed, purpose, number) for number in numbers)
         name = f"{purpose.name.lower()} scenes"
         bar = self.progress.bar(total=episodes, desc=name, unit="episode", leave=False)
-        with self.clock.measure("evaluation"), bar as shown:
+        with bar as shown:
             return evaluate(
                 self.evaluation_env,
                 self.learner.policy,
@@ -224,6 +234,14 @@ class TrainingRun:
                 device=self.config.torch_device,
                 on_episode=lambda _: shown.update(1),
             )
+
+    def _log_symmetry(self) -> None:
+        # Rows as they are stored: a sample would draw random numbers, and turn them.
+        first = self.buffer.storage[: min(len(self.buffer), _FIRST)]
+        observations = replay_observations(first, self.max_depth, _OBSERVATIONS)
+        networks = (self.learner.policy, self.learner.critic)
+        errors = symmetry_errors(networks, self.config.group, observations)
+        self.log.write("symmetry", {"step": self.step, **errors})
 
     def _save(self) -> None:
         with self.clock.measure("checkpoint"):

@@ -27,7 +27,7 @@ class MetricsLog:
         config: Says which trackers are wanted, and is shown there.
     """
 
-    TABLES = ("metrics", "validation", "timing")
+    TABLES = ("metrics", "validation", "symmetry", "timing")
 
     def __init__(self, folder: Path, config: Config):
         self.folder = folder

@@ -1,0 +1,30 @@
+"""What all figures share: matplotlib without a display, colours, and how a file is written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["COLOURS", "pyplot", "save"]
+
+COLOURS = ("#0b6e99", "#d9730d", "#448361", "#9065b0", "#c14c8a")
+
+
+def pyplot() -> Any:
+    """Matplotlib's pyplot, imported when a figure is drawn, in the style of all figures."""
+    import matplotlib
+
+    matplotlib.use("Agg")  # no display is needed
+    import matplotlib.pyplot as plt
+
+    plt.rcParams.update({"axes.spines.top": False, "axes.spines.right": False, "font.size": 9})
+    return plt
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Writes a figure as PNG and forgets it."""
+    figure.savefig(path, dpi=110)
+    pyplot().close(figure)
