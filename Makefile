@@ -14,7 +14,7 @@ $(READY): setup.py setup.cfg pyproject.toml constraints.txt $(KERNELS)
 	@command -v $(PYTHON) >/dev/null || { echo "error: $(PYTHON) not found; equirl needs Python 3.11 (PyBullet has no newer wheels)"; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
-	$(BIN)/uv pip install --quiet --compile-bytecode --python $(BIN)/python -c constraints.txt -e '.[dev,tracking,meshes,sb3]'
+	$(BIN)/uv pip install --quiet --compile-bytecode --python $(BIN)/python -c constraints.txt -e '.[dev,tracking,meshes,sb3,export]'
 	touch $@
 
 # Trains on Block Picking from nothing to a report; interrupted, it goes on where it stopped.

@@ -121,9 +121,9 @@ def _mendable() -> tuple[type[Exception], ...]:
     from equirl.analysis import TableError
     from equirl.collectors import DemonstrationError
     from equirl.envs import PlacementError
-    from equirl.training import CheckpointError, FolderError
+    from equirl.training import CheckpointError, ExportError, FolderError
 
     return (
         *(ConfigError, FolderError, CheckpointError, TableError),
-        *(DemonstrationError, PlacementError),
+        *(DemonstrationError, ExportError, PlacementError),
     )
