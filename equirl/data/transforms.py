@@ -67,17 +67,22 @@ class RotationAugmentation(Transform):
     and then one of its n + 1 versions uniformly is the same distribution as storing
     every copy, for a fraction 1 / (n + 1) of the memory.
 
+    It is a transform of any TorchRL replay buffer that is filled by ``extend``, one row a
+    transition; `docs/custom_pipeline.md` shows one.
+
     Args:
         copies: Rotated copies a transition, n >= 0.
-        spec: How each key transforms; that of planar manipulation when None.
+        spec: How each key transforms; that of planar manipulation when None. Every
+            transition must have the keys it names.
         generator: Source of the angles and of the choice among copies.
-        bounds: Keys whose turned values are clipped, with lowest and highest value;
-            the action to [-1, 1] when None. An action whose (x, y) lies off the unit
-            disc can leave its box when turned, and the paper's system clips it; on the
-            disc, where ``strict`` actions live, nothing is clipped.
+        bounds: Keys whose turned values are clipped, with lowest and highest value; when
+            None, ``action`` to [-1, 1] if the spec names it. An action whose (x, y) lies off
+            the unit disc can leave its box when turned, and the paper's system clips it; on
+            the disc, where ``strict`` actions live, nothing is clipped.
 
     Raises:
-        ValueError: ``copies`` is negative.
+        ValueError: ``copies`` is negative; at insertion, a key is missing or the batch has
+            several dimensions; at sampling, what is to be turned does not hold floats.
     """
 
     ANGLES = "augmentation_angles"
@@ -96,9 +101,22 @@ class RotationAugmentation(Transform):
         self.copies = copies
         self.spec = manipulation_spec() if spec is None else spec
         self.generator = generator
-        self.bounds = {"action": (-1.0, 1.0)} if bounds is None else dict(bounds)
+        if bounds is None:
+            bounds = {"action": (-1.0, 1.0)} if "action" in self.spec.keys else {}
+        self.bounds = dict(bounds)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        missing = [key for key in self.spec.keys if tensordict.get(key, None) is None]
+        if missing:
+            raise ValueError(
+                f"the symmetry names {missing}, which these transitions do not have: "
+                f"{sorted(map(str, tensordict.keys()))}"
+            )
+        if tensordict.batch_dims > 1:
+            raise ValueError(
+                "expected one row a transition, got a batch of size "
+                f"{tuple(tensordict.batch_size)}: extend the buffer with data.reshape(-1)"
+            )
         out = tensordict.clone(recurse=False)
         angles = torch.zeros(*tensordict.batch_size, self.copies + 1)
         drawn = torch.rand(*tensordict.batch_size, self.copies, generator=self.generator)
@@ -107,6 +125,13 @@ class RotationAugmentation(Transform):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Turns each row of a sampled batch (B,) into one of its n + 1 versions."""
+        for key in self.spec.keys:
+            dtype = tensordict.get(key).dtype
+            if not dtype.is_floating_point:
+                raise ValueError(
+                    f"{key} is of {dtype} and cannot be turned: expected floats; images get "
+                    "them from TorchRL's ToTensorImage, for example"
+                )
         angles = tensordict.pop(self.ANGLES)
         (batch,) = tensordict.batch_size
         copy = torch.randint(self.copies + 1, (batch,), generator=self.generator)

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from equirl.data import (
     TRANSITION_KEYS,
@@ -14,7 +15,7 @@ from equirl.data import (
     make_replay_buffer,
     replay_state,
 )
-from equirl.symmetry import Representation, SymmetrySpec, manipulation_spec
+from equirl.symmetry import Representation, ScalarField, SymmetrySpec, manipulation_spec
 from tests.transitions import transitions
 
 
@@ -152,3 +153,53 @@ def test_bad_arguments_are_named():
         buffer.extend(data)
     with pytest.raises(ValueError, match="capacity 3 cannot hold .* 4 copies"):
         make_replay_buffer(3, copies=4)
+
+
+def images_and_moves(rows: int = 20) -> TensorDict:
+    """Transitions of an environment that has nothing to do with manipulation."""
+    data = {
+        "pixels": torch.rand(rows, 2, 16, 16),
+        "move": torch.rand(rows, 2),
+        "speed": torch.rand(rows),
+    }
+    return TensorDict({**data, "next": TensorDict({"pixels": data["pixels"] + 1}, [rows])}, [rows])
+
+
+def foreign_buffer(keys=("pixels", "move")) -> ReplayBuffer:
+    rules = {"pixels": ScalarField(), "move": Representation("vector")}
+    return ReplayBuffer(
+        storage=LazyTensorStorage(100),
+        transform=RotationAugmentation(
+            4, spec=SymmetrySpec({key: rules[key] for key in keys}), generator=generator()
+        ),
+        batch_size=64,
+    )
+
+
+def test_transitions_of_other_environments_in_a_buffer_of_torchrl():
+    stored, buffer = images_and_moves(), foreign_buffer()
+    buffer.extend(stored)
+    batch = buffer.sample()
+    assert set(batch.keys()) == {"pixels", "move", "speed", "next"}
+    lengths = stored["move"].norm(dim=-1)
+    for row in batch:  # nothing is clipped: there is no `action`
+        index = (stored["speed"] == row["speed"]).nonzero().item()
+        torch.testing.assert_close(row["move"].norm(), lengths[index])
+        torch.testing.assert_close(row["next", "pixels"], row["pixels"] + 1)
+    unturned = (batch["speed"][:, None] == stored["speed"]).long().argmax(-1)
+    assert 0 < (batch["move"] == stored["move"][unturned]).all(-1).float().mean() < 0.5
+
+
+def test_what_cannot_be_turned_is_told():
+    data = images_and_moves()
+    with pytest.raises(ValueError, match=r"names \['move'\], which .* do not have: .*'pixels'"):
+        foreign_buffer().extend(data.exclude("move"))
+    with pytest.raises(ValueError, match=r"size \(4, 5\): extend the buffer with data.reshape"):
+        foreign_buffer().extend(data.reshape(4, 5))
+    data["pixels"] = (255 * data["pixels"]).byte()
+    data["next", "pixels"] = data["pixels"]
+    buffer = foreign_buffer()
+    buffer.extend(data)
+    with pytest.raises(ValueError, match=r"pixels is of torch.uint8 .* ToTensorImage"):
+        buffer.sample()
+    foreign_buffer(keys=("move",)).extend(data)  # images that stay may be bytes
