@@ -38,6 +38,7 @@ CONFINED = {
     "trimesh": "envs/objects/convex_pieces.py",
     "coacd": "envs/objects/convex_pieces.py",
     "tqdm": "training/progress.py",
+    "onnxruntime": "training/export",
 }
 
 
