@@ -87,7 +87,7 @@ def main() -> None:
 def build(arguments: argparse.Namespace) -> None:
     """Seconds to build an actor and a critic at the paper's size."""
     print_header("group", "seconds", "actor parameters", "critic parameters")
-    for group in ("C4", "C8", "D4", "D8"):
+    for group in ("C4", "C8", "D4", "D8", "SO2", "O2"):
         start = time.perf_counter()
         networks = make_actor(group), make_critic(group)
         seconds = time.perf_counter() - start

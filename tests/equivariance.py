@@ -20,9 +20,10 @@ Turn = Callable[[Tensor, int, bool], Tensor]
 
 def grid_elements(group: str) -> list[tuple[int, bool]]:
     """(quarter turns, reflected) for every element that maps the pixels onto themselves."""
-    order = int(group[1:])
+    order = 4 if group in ("SO2", "O2") else int(group[1:])
     turns = [k for k in range(4) if k * order % 4 == 0]
-    return [(k, flip) for flip in ((False, True) if group[0] == "D" else (False,)) for k in turns]
+    flips = (False, True) if group[0] in "DO" else (False,)
+    return [(k, flip) for flip in flips for k in turns]
 
 
 def turn_image(image: Tensor, turns: int, flip: bool) -> Tensor:

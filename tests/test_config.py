@@ -41,8 +41,9 @@ def test_copies_are_those_of_the_augmentation_in_use():
     assert to_config(GOOD | {"augmentation": {"name": "none"}}).copies == 0
 
 
-def test_group_is_normalised():
-    assert to_config(GOOD | {"group": "d8"}).group == "D8"
+@pytest.mark.parametrize(("given", "kept"), [("d8", "D8"), ("so2", "SO2"), ("O2", "O2")])
+def test_group_is_normalised(given, kept):
+    assert to_config(GOOD | {"group": given}).group == kept
 
 
 @pytest.mark.parametrize(
@@ -51,7 +52,7 @@ def test_group_is_normalised():
         ({"sede": 1}, "sede"),
         ({"seed": "one"}, "seed"),
         ({"seed": -1}, "seed=-1: expected 0 or more"),
-        ({"group": "SO2"}, "group=SO2.*not available yet"),
+        ({"group": "SO3"}, "group=SO3: unknown symmetry group .*expected SO2, O2, or C<n> or D<n>"),
         ({"mode": "exact"}, "mode=exact: expected one of strict, paper"),
         ({"method": {"name": "ferm"}}, "method=ferm: expected one of equivariant, cnn"),
         ({"algorithm": {"name": "sacfd"}}, "algorithm=sacfd: expected one of sac"),

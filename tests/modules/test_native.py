@@ -7,6 +7,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from escnn_reference import escnn_convolution
+from tensordict import TensorDict
 from torch.autograd import forward_ad
 from torch.func import functional_call, stack_module_state, vmap
 
@@ -25,6 +26,7 @@ from tests.equivariance import assert_equivariant, turn_fields, turn_image
 
 slow = pytest.mark.slow
 GROUPS = ("C4", "D4", "C8", "D8")
+ALL_GROUPS = (*GROUPS, "SO2", "O2")
 #: For every instruction set, from the least.
 CAPABILITIES = {"baseline": "DEFAULT", "AVX2": "AVX2", "AVX-512": "AVX512"}
 
@@ -59,10 +61,10 @@ def make_layer(group, fields_in, fields_out, padding, kind="regular", seed=0):
 
 def through_kernels(conv, x, pool=False, relu=False, block=native.BLOCK):
     """The layer on images in the usual layout and order of channels."""
-    basis = spectral_basis(conv.in_type.group, conv.in_type.kinds[0])
     channels = 1
-    if basis.regular:
-        channels, order = basis.order, native.channel_order(conv.in_type)
+    if conv.in_type.is_regular:
+        order = native.channel_order(conv.in_type)
+        channels = spectral_basis(conv.in_type.group, "hidden").space.channels
         x = x if order is None else x[:, order.argsort()]
     y = native.conv_block(conv, native.to_blocks(x, channels, block), pool=pool, relu=relu)
     y = native.from_blocks(y, len(x))
@@ -188,7 +190,7 @@ def calls(monkeypatch):
         pytest.param(64, 128, marks=slow),
     ],
 )
-@pytest.mark.parametrize("group", GROUPS)
+@pytest.mark.parametrize("group", ALL_GROUPS)
 @pytest.mark.parametrize("batch", [1, 5])
 def test_an_encoder_equals_the_dense_one(group, hidden, size, batch, calls):
     fast, dense = make_encoder(group, hidden, size), make_encoder(group, hidden, size, "dense")
@@ -198,8 +200,9 @@ def test_an_encoder_equals_the_dense_one(group, hidden, size, batch, calls):
     assert fast.backend == "native" and len(calls) == 1
 
 
-def test_gradients_of_an_encoder():
-    fast, dense = make_encoder("D4"), make_encoder("D4", backend="dense").double()
+@pytest.mark.parametrize("group", ["D4", "O2"])
+def test_gradients_of_an_encoder(group):
+    fast, dense = make_encoder(group), make_encoder(group, backend="dense").double()
     observation = images(6, 32)
     fast(*observation).square().sum().backward()
     dense(*(x.double() for x in observation)).square().sum().backward()
@@ -207,7 +210,7 @@ def test_gradients_of_an_encoder():
         assert_close(mine.grad, its.grad, 1e-4)
 
 
-@pytest.mark.parametrize("group", GROUPS)
+@pytest.mark.parametrize("group", ALL_GROUPS)
 def test_features_turn_with_the_image(group):
     encoder, (depth, holding) = make_encoder(group), images(4, 32)
     with torch.no_grad():
@@ -215,15 +218,16 @@ def test_features_turn_with_the_image(group):
         assert_equivariant(
             lambda **inputs: {"features": encoder(**inputs)},
             group,
-            {"depth": depth, "holding": holding},
-            {"depth": turn_image, "features": turn_fields(encoder.out_type)},
+            {"image": depth, "invariants": holding},
+            {"image": turn_image, "features": turn_fields(encoder.out_type)},
             case="native encoder",
             tolerance=1e-4 * scale,
         )
 
 
-def test_bit_for_bit_the_same_on_any_number_of_threads(instruction_set):
-    encoder, observation = make_encoder("D4"), images(40, 32)
+@pytest.mark.parametrize("group", ["D4", "SO2"])
+def test_bit_for_bit_the_same_on_any_number_of_threads(instruction_set, group):
+    encoder, observation = make_encoder(group), images(40, 32)
 
     def run(threads):
         torch.set_num_threads(threads)
@@ -240,16 +244,18 @@ def test_bit_for_bit_the_same_on_any_number_of_threads(instruction_set):
         assert torch.equal(a, b) and torch.equal(a, c)
 
 
-def test_an_image_does_not_depend_on_its_batch():
-    encoder, (depth, holding) = make_encoder("D4"), images(37, 32)
+@pytest.mark.parametrize("group", ["D4", "O2"])
+def test_an_image_does_not_depend_on_its_batch(group):
+    encoder, (depth, holding) = make_encoder(group), images(37, 32)
     features = encoder(depth, holding)
     assert torch.equal(features[20:], encoder(depth[20:], holding[20:]))
     batched = encoder(depth[:36].view(4, 9, 1, 32, 32), holding[:36].view(4, 9, 1))
     assert torch.equal(batched.flatten(0, 1), features[:36])
 
 
-def test_what_the_kernels_do_not_serve_runs_dense(calls):
-    encoder, (depth, holding) = make_encoder("D4"), images(4, 32)
+@pytest.mark.parametrize("group", ["D4", "SO2"])
+def test_what_the_kernels_do_not_serve_runs_dense(calls, group):
+    encoder, (depth, holding) = make_encoder(group), images(4, 32)
     expected = encoder(depth, holding)
     assert len(calls) == 1
     precise = copy.deepcopy(encoder).double()(depth.double(), holding.double())
@@ -272,10 +278,38 @@ def test_what_the_kernels_do_not_serve_runs_dense(calls):
         assert_close(other, expected, 1e-4)
 
 
+@pytest.mark.parametrize("batch", [2, 20])
+@pytest.mark.parametrize("group", ["D4", "O2"])
+def test_parameters_swapped_in_by_tensordict(calls, group, batch):
+    """As TorchRL's losses do: not parameters any more, in attributes of the modules."""
+    encoder, other, observation = make_encoder(group), make_encoder(group), images(batch, 32)
+    with torch.no_grad():
+        for parameter in other.parameters():
+            parameter.normal_(0, 0.1)
+    features = other(*observation)
+    features.square().sum().backward()
+    swapped = TensorDict.from_module(other).data.clone().requires_grad_()
+    with swapped.to_module(encoder):
+        again = encoder(*observation)
+    assert torch.equal(again, features) and len(calls) == 2
+    again.square().sum().backward()
+    for name, parameter in other.named_parameters():
+        assert torch.equal(swapped[tuple(name.split("."))].grad, parameter.grad)
+
+    def run(parameters):
+        with parameters.to_module(encoder):
+            return encoder(*observation)
+
+    both = torch.stack([swapped.data, swapped.data])
+    assert_close(vmap(run)(both)[1], features, 1e-4)
+    assert len(calls) == 2
+
+
 @pytest.mark.parametrize("batch", [1, 3, 5])
 @pytest.mark.parametrize("frozen", ["weights", "bias"])
-def test_frozen_parameters(batch, frozen):
-    encoder, observation = make_encoder("D4"), images(batch, 32)
+@pytest.mark.parametrize("group", ["D4", "O2"])
+def test_frozen_parameters(group, batch, frozen):
+    encoder, observation = make_encoder(group), images(batch, 32)
     encoder(*observation).square().sum().backward()
     expected = {name: p.grad.clone() for name, p in encoder.named_parameters()}
     encoder.zero_grad()
@@ -289,13 +323,14 @@ def test_frozen_parameters(batch, frozen):
             assert torch.equal(parameter.grad, expected[name])
 
 
+@pytest.mark.parametrize("group", ["C8", "O2"])
 @pytest.mark.parametrize("context", [torch.inference_mode, lambda: torch.device("meta")])
-def test_what_is_made_at_first_use_serves_everywhere(context):
+def test_what_is_made_at_first_use_serves_everywhere(context, group):
     caches = spectral_basis, native.channel_order
     for cache in caches:
         cache.cache_clear()
     try:
-        encoder, observation = make_encoder("C8"), images(4, 32)
+        encoder, observation = make_encoder(group), images(4, 32)
         with context():
             encoder(*observation)
         encoder(*observation).sum().backward()
@@ -408,11 +443,11 @@ def test_a_network_without_its_library_says_so(monkeypatch):
 def test_an_expanded_pair_has_the_filter_of_its_weights(mirror):
     """The spectral weights of cosets, put together, are the dense filter of the larger group."""
     conv = make_layer("D8" if mirror else "C8", 2, 3, 1)
-    basis = spectral_basis(conv.in_type.group, "regular")
+    basis = spectral_basis(conv.in_type.group, "hidden")
     spectral = basis.expand(conv.weights.detach(), 3, 2)
     assert spectral.shape == (6, 4, basis.size)
     small = make_layer("D4" if mirror else "C4", 4, 6, 1)
-    inverse = torch.linalg.inv(spectral_basis(small.in_type.group, "regular").expansion.double())
+    inverse = torch.linalg.inv(spectral_basis(small.in_type.group, "hidden").expansion.double())
     small.weights.data = (spectral.double() @ inverse).float().flatten()
     channels = torch.tensor(basis.channels)
     order = conv.in_type.group.order

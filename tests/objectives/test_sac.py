@@ -22,10 +22,10 @@ def batch() -> TensorDict:
     return transitions(BATCH, SIZE)
 
 
-def networks(mode: str = "strict"):
+def networks(mode: str = "strict", group: str = "D4"):
     generator = torch.Generator().manual_seed(1)
     size = {"hidden": 8, "image_size": SIZE, "mode": mode, "generator": generator}
-    return make_actor("D4", **size), make_critic("D4", **size)
+    return make_actor(group, **size), make_critic(group, **size)
 
 
 def make_loss(actor, critic) -> SACLoss:
@@ -64,9 +64,11 @@ def plain_losses(actor, critic, target_critic, log_alpha, data, seed):
     }
 
 
-@pytest.mark.parametrize("mode", ["strict", "paper"])
-def test_losses_and_gradients_equal_a_plain_computation(mode):
-    actor, critic = networks(mode)
+@pytest.mark.parametrize(
+    ("mode", "group"), [("strict", "D4"), ("paper", "D4"), ("strict", "O2"), ("paper", "SO2")]
+)
+def test_losses_and_gradients_equal_a_plain_computation(mode, group):
+    actor, critic = networks(mode, group)
     plain_actor, plain_critic = copy.deepcopy(actor), copy.deepcopy(critic)
     plain_target = copy.deepcopy(critic)
     loss = make_loss(actor, critic)

@@ -186,14 +186,14 @@ def test_a_failing_job_does_not_stop_a_multirun(here, tmp_path):
         "train.py",
         "--multirun",
         *(key for key in SMOKE if not key.startswith("group")),
-        "group=so2,c4",
+        "group=so3,c4",
         "steps=4",
         "demos.episodes=1",
         "evaluation.final_episodes=1",
         "evaluation.video_episodes=0",
         f"hydra.sweep.dir={tmp_path}",
     )
-    assert code == 1 and "1 jobs failed" in err and "group=so2" in err and "Traceback" not in err
+    assert code == 1 and "1 jobs failed" in err and "group=so3" in err and "Traceback" not in err
     assert "of 1 episodes succeed" in out
 
 

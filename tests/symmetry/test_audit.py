@@ -253,6 +253,16 @@ def test_elements_that_are_audited():
         audited(group="C3")
 
 
+@pytest.mark.parametrize(("group", "counts"), [("SO2", (3, 0)), ("O2", (3, 4))])
+def test_of_a_continuous_group_the_grid_elements_are_audited(group, counts):
+    audit = audited(group=group)
+    assert len(audit.elements) == sum(counts)
+    assert all(element.preserves_grid for element in audit.elements)
+    expected = f"{group}: {counts[0]} turns and {counts[1]} reflections audited, all other elements"
+    assert expected in audit.table()
+    assert audit.findings == []
+
+
 @pytest.mark.parametrize("option", ["scenes", "steps"])
 def test_there_must_be_something_to_play(option):
     with pytest.raises(ValueError, match=f"{option} must be at least 1, got 0"):
