@@ -125,6 +125,8 @@ class RotationAugmentation(Transform):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Turns each row of a sampled batch (B,) into one of its n + 1 versions."""
+        if not self.copies:
+            return tensordict.exclude(self.ANGLES)
         for key in self.spec.keys:
             dtype = tensordict.get(key).dtype
             if not dtype.is_floating_point:

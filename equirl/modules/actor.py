@@ -14,8 +14,8 @@ from equirl.modules.distributions import RadialTanhNormal
 from equirl.modules.encoder import EquivariantEncoder
 from equirl.modules.fields import FieldType
 from equirl.modules.steerable import SteerableLinear
-from equirl.modules.wiring import OBSERVATION_KEYS, as_actor, check_keys
-from equirl.symmetry import Representation, SymmetryGroup, action_representation
+from equirl.modules.wiring import OBSERVATION_KEYS, as_actor, check_keys, resolve_action
+from equirl.symmetry import Representation, SymmetryGroup
 
 __all__ = ["LOG_STD_RANGE", "EquivariantPolicy", "make_actor"]
 
@@ -53,7 +53,7 @@ class EquivariantPolicy(nn.Module):
     ):
         super().__init__()
         self.encoder = encoder
-        self.out_rep = action_representation(mode) if action is None else action
+        self.out_rep = resolve_action(action, mode)
         self.sharing: tuple[int, ...]
         self.distribution: type[torch.distributions.Distribution]
         self.distribution_options: dict[str, Any]

@@ -14,8 +14,8 @@ from equirl.modules.fields import FieldType
 from equirl.modules.nonlinearity import make_activation
 from equirl.modules.pooling import make_invariant_pool
 from equirl.modules.steerable import SteerableLinear
-from equirl.modules.wiring import OBSERVATION_KEYS, as_critic, check_keys
-from equirl.symmetry import Representation, SymmetryGroup, action_representation
+from equirl.modules.wiring import OBSERVATION_KEYS, as_critic, check_keys, resolve_action
+from equirl.symmetry import Representation, SymmetryGroup
 
 __all__ = ["EquivariantQHeads", "make_critic"]
 
@@ -58,8 +58,8 @@ class EquivariantQHeads(nn.Module):
             raise ValueError(f"expected the hidden fields of an encoder, got {features}")
         width = hidden if width is None else width
         if not isinstance(width, int) or width < 1:
-            raise ValueError(f"head_width={width!r}: expected a positive integer")
-        self.in_rep = action_representation(mode) if action is None else action
+            raise ValueError(f"width of the heads, {width!r}: expected a positive integer")
+        self.in_rep = resolve_action(action, mode)
         self.in_type = features + FieldType.of(group, self.in_rep)
         self.out_type = FieldType.trivial(group, heads)
         # The heads' first layers side by side: one filter, one product.

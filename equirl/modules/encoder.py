@@ -13,7 +13,7 @@ from equirl.modules.native import layer as native
 from equirl.modules.nonlinearity import make_activation
 from equirl.modules.pooling import make_pixel_pool
 from equirl.modules.steerable import SteerableConv
-from equirl.symmetry import SymmetryGroup, action_representation
+from equirl.symmetry import SymmetryGroup
 
 __all__ = ["EquivariantEncoder"]
 
@@ -66,7 +66,6 @@ class EquivariantEncoder(nn.Module):
     ):
         super().__init__()
         check_sizes(hidden, image_size)
-        action_representation(mode)
         for name, count, least in (("channels", channels, 1), ("invariants", invariants, 0)):
             if not isinstance(count, int) or count < least:
                 raise ValueError(f"{name}={count!r}: expected an integer of at least {least}")

@@ -71,7 +71,8 @@ class FieldType:
         kinds: The different fields, in the order of their first appearance.
 
     Raises:
-        ValueError: A field of a continuous group is regular.
+        ValueError: The group has no such field; a vector of frequency k is irreducible for
+            more than 2 k rotations only.
     """
 
     group: SymmetryGroup
@@ -82,7 +83,27 @@ class FieldType:
     def __post_init__(self) -> None:
         # Now, for torch.compile does not enter the lock of a cached property.
         object.__setattr__(self, "kinds", tuple(dict.fromkeys(self.fields)))
+        possible = self._possible()
+        for kind in self.kinds:
+            if kind not in possible:
+                raise ValueError(
+                    f"{self.group.name} has no field {kind!r}: expected one of "
+                    f"{', '.join(possible)}"
+                )
         object.__setattr__(self, "size", sum(self.dim(name) for name in self.fields))
+
+    def _possible(self) -> list[str]:
+        """The names of the fields that the group has."""
+        group = self.group
+        names = [REGULAR, TRIVIAL] if group.is_finite else [TRIVIAL]
+        names += [SIGN] if group.reflections else []
+        if group.is_finite and group.rotations == 2:
+            return [*names, VECTOR_X, *([VECTOR_Y] if group.reflections else [])]
+        return names + [
+            name
+            for name, frequency in _FREQUENCIES.items()
+            if not group.is_finite or group.rotations > 2 * frequency
+        ]
 
     @classmethod
     def regular(cls, group: SymmetryGroup, count: int) -> FieldType:
@@ -128,6 +149,17 @@ class FieldType:
         if self.group != other.group:
             raise ValueError(f"cannot add fields of {self.group} and {other.group}")
         return FieldType(self.group, self.fields + other.fields)
+
+    def check(self, x: Tensor, dim: int = -1) -> None:
+        """Checks that dimension ``dim`` of ``x`` holds these fields' channels.
+
+        Raises:
+            ValueError: It does not.
+        """
+        if not -x.ndim <= dim < x.ndim or x.shape[dim] != self.size:
+            raise ValueError(
+                f"expected {self.size} channels in dimension {dim} for {self}, got {tuple(x.shape)}"
+            )
 
     def dim(self, field: str) -> int:
         """Number of channels of one field."""
@@ -190,8 +222,7 @@ class FieldType:
         Raises:
             ValueError: The element is not in the group, or the size is not this type's.
         """
-        if x.shape[-1] != self.size:
-            raise ValueError(f"expected {self.size} channels for {self}, got {tuple(x.shape)}")
+        self.check(x)
         if element not in self.group:
             raise ValueError(f"{element} is not an element of {self.group}")
         source = self._source_elements(element) if REGULAR in self.fields else []

@@ -55,11 +55,11 @@ def pyramid(image_size: int) -> list[float]:
 
 
 class Layer(NamedTuple):
-    """A 3 x 3 convolution with a ReLU, and what follows it."""
+    """A 3 x 3 convolution with its activation, and what follows it."""
 
     width: int
     padding: int
-    pool: bool  # whether a 2 x 2 maximum follows
+    pool: bool  # whether 2 x 2 pixels are pooled then
 
 
 def skeleton(

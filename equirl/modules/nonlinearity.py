@@ -24,20 +24,27 @@ class FieldReLU(nn.Module):
 
     Args:
         fields: Regular or trivial fields, of input and output.
+        inplace: Whether the output takes the place of the input in memory.
 
     Raises:
         ValueError: A field is of another kind, whose channels a group mixes.
     """
 
-    def __init__(self, fields: FieldType):
+    def __init__(self, fields: FieldType, inplace: bool = False):
         super().__init__()
         if not fields.is_permuted:
             raise ValueError(f"a ReLU commutes with regular and trivial fields, got {fields}")
         self.in_type = self.out_type = fields
+        self.inplace = inplace
 
     def forward(self, x: Tensor, dim: int = -1) -> Tensor:
-        """The ReLU of ``x``, computed in its memory; ``dim`` holds the channels."""
-        return F.relu(x, inplace=True)
+        """The ReLU of ``x``, of ``in_type.size`` channels in dimension ``dim``.
+
+        Raises:
+            ValueError: The channels are not these.
+        """
+        self.in_type.check(x, dim)
+        return F.relu(x, inplace=self.inplace)
 
 
 class GatedNonlinearity(WithConstants):
@@ -68,7 +75,12 @@ class GatedNonlinearity(WithConstants):
             self._field_of = fields.channels().field_of
 
     def forward(self, x: Tensor, dim: int = -1) -> Tensor:
-        """Gates ``x``, of ``in_type.size`` channels in dimension ``dim``."""
+        """Gates ``x``, of ``in_type.size`` channels in dimension ``dim``.
+
+        Raises:
+            ValueError: The channels are not these.
+        """
+        self.in_type.check(x, dim)
         values, gates = x.split([self.out_type.size, len(self.bias)], dim)
         shape = [1] * x.ndim
         shape[dim] = -1
@@ -77,5 +89,8 @@ class GatedNonlinearity(WithConstants):
 
 
 def make_activation(fields: FieldType) -> FieldReLU | GatedNonlinearity:
-    """The activation of hidden fields: a ReLU where the group permutes channels, else gates."""
-    return FieldReLU(fields) if fields.is_permuted else GatedNonlinearity(fields)
+    """The activation of hidden fields: a ReLU where the group permutes channels, else gates.
+
+    The ReLU writes over its input, which the layer before has just computed.
+    """
+    return FieldReLU(fields, inplace=True) if fields.is_permuted else GatedNonlinearity(fields)

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from equirl.modules.constants import WithConstants
 from equirl.modules.fields import FieldType
+from equirl.symmetry import check_mode
 
 __all__ = [
     "FieldMaxPool",
@@ -22,6 +23,15 @@ __all__ = [
 
 #: Added to squared norms, whose roots would have no derivative at zero.
 EPSILON = 1e-12
+
+
+def _epsilon(x: Tensor) -> float:
+    return max(EPSILON, torch.finfo(x.dtype).tiny)
+
+
+def _check_even(x: Tensor) -> None:
+    if x.ndim != 4 or x.shape[-2] % 2 or x.shape[-1] % 2:
+        raise ValueError(f"expected maps (B, C, H, W) of even H and W, got {tuple(x.shape)}")
 
 
 class FieldMaxPool(nn.Module):
@@ -41,7 +51,13 @@ class FieldMaxPool(nn.Module):
         self.in_type = self.out_type = fields
 
     def forward(self, x: Tensor) -> Tensor:
-        """Maps (B, size, H, W) to (B, size, H / 2, W / 2)."""
+        """Maps (B, size, H, W) to (B, size, H / 2, W / 2).
+
+        Raises:
+            ValueError: The height or the width is odd, or the channels are not these.
+        """
+        _check_even(x)
+        self.in_type.check(x, 1)
         return F.max_pool2d(x, 2)
 
 
@@ -90,20 +106,22 @@ class NormMaxPool(_Norms):
         """Maps (B, size, H, W) to (B, size, H / 2, W / 2).
 
         Raises:
-            ValueError: The height or the width is odd.
+            ValueError: The height or the width is odd, or the channels are not these.
         """
-        if x.shape[-2] % 2 or x.shape[-1] % 2:
-            raise ValueError(f"expected maps of even height and width, got {tuple(x.shape)}")
+        _check_even(x)
+        self.in_type.check(x, 1)
         pixels = [x[..., i::2, j::2] for i in (0, 1) for j in (0, 1)]
         norms = [self._squared_norms(pixel, 1) for pixel in pixels]
         if self.ties == "first":
             best, largest = pixels[0], norms[0]
             for pixel, norm in zip(pixels[1:], norms[1:], strict=True):
-                better = norm > largest
+                better = (norm > largest) | norm.isnan()  # not a number wins
                 best = torch.where(better.index_select(1, self._field_of), pixel, best)
                 largest = torch.where(better, norm, largest)
             return best
-        weights = [(norm + EPSILON).square() for norm in norms]
+        # Relative to the largest norm, which cancels: the fourth power of a norm may overflow.
+        largest = torch.stack(norms).detach().amax(0) + _epsilon(x)
+        weights = [((norm + _epsilon(x)) / largest).square() for norm in norms]
         total = sum(weights[1:], weights[0])
         shares = [(weight / total).index_select(1, self._field_of) for weight in weights]
         parts = [share * pixel for share, pixel in zip(shares, pixels, strict=True)]
@@ -128,7 +146,12 @@ class GroupMaxPool(nn.Module):
         self.out_type = FieldType.trivial(in_type.group, len(in_type.fields))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Maps ``x`` of shape (..., fields * group order) to (..., fields)."""
+        """Maps ``x`` of shape (..., fields * group order) to (..., fields).
+
+        Raises:
+            ValueError: The channels are not these.
+        """
+        self.in_type.check(x)
         # amax shares the gradient evenly among tied maxima, as the symmetry demands;
         # max would give it to the first.
         return x.unflatten(-1, (-1, self.in_type.group.order)).amax(-1)
@@ -150,12 +173,22 @@ class NormPool(_Norms):
         self.out_type = FieldType.trivial(in_type.group, len(in_type.fields))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Maps ``x`` of shape (..., size) to (..., fields)."""
-        return (self._squared_norms(x, -1) + EPSILON).sqrt()
+        """Maps ``x`` of shape (..., size) to (..., fields).
+
+        Raises:
+            ValueError: The channels are not these.
+        """
+        self.in_type.check(x)
+        return (self._squared_norms(x, -1) + _epsilon(x)).sqrt()
 
 
 def make_pixel_pool(fields: FieldType, mode: str = "strict") -> FieldMaxPool | NormMaxPool:
-    """The pooling of hidden fields over 2 x 2 pixels; ``"paper"`` takes the first of ties."""
+    """The pooling of hidden fields over 2 x 2 pixels; ``"paper"`` takes the first of ties.
+
+    Raises:
+        ValueError: The mode is neither ``"strict"`` nor ``"paper"``.
+    """
+    check_mode(mode)
     if fields.is_permuted:
         return FieldMaxPool(fields)
     return NormMaxPool(fields, ties="first" if mode == "paper" else "shared")

@@ -10,7 +10,9 @@ from tensordict.utils import NestedKey
 from torch import nn
 from torchrl.modules import ProbabilisticActor
 
-__all__ = ["OBSERVATION_KEYS", "as_actor", "as_critic", "check_keys"]
+from equirl.symmetry import Representation, action_representation, check_mode
+
+__all__ = ["OBSERVATION_KEYS", "as_actor", "as_critic", "check_keys", "resolve_action"]
 
 #: The observation of the manipulation environments.
 OBSERVATION_KEYS = ("depth", "holding")
@@ -25,6 +27,23 @@ def check_keys(in_keys: Sequence[NestedKey], invariants: int) -> None:
     if isinstance(in_keys, str) or len(in_keys) != 1 + (invariants != 0):
         wanted = "of an image and of its invariants" if invariants else "of an image alone"
         raise ValueError(f"in_keys={in_keys!r}, invariants={invariants!r}: expected keys {wanted}")
+
+
+def resolve_action(action: Representation | None, mode: str) -> Representation:
+    """How an action transforms: as stated, or, if None, as the manipulation action of a mode.
+
+    Raises:
+        ValueError: It is no representation, an empty one, or the mode does not exist.
+    """
+    check_mode(mode)
+    if action is None:
+        return action_representation(mode)
+    if not isinstance(action, Representation) or not action.dim:
+        raise ValueError(
+            f"action={action!r}: expected a Representation of one component or more, for example "
+            'Representation("vector")'
+        )
+    return action
 
 
 def as_actor(

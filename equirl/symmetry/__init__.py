@@ -12,6 +12,7 @@ from equirl.symmetry.spec import (
     ACTION_PAPER,
     SymmetrySpec,
     action_representation,
+    check_mode,
     manipulation_spec,
 )
 
@@ -28,6 +29,7 @@ __all__ = [
     "SymmetrySpec",
     "action_representation",
     "audit_env",
+    "check_mode",
     "equivariance_report",
     "error_table",
     "layer_table",

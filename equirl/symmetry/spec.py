@@ -18,6 +18,7 @@ __all__ = [
     "MODES",
     "SymmetrySpec",
     "action_representation",
+    "check_mode",
     "manipulation_spec",
 ]
 
@@ -31,6 +32,16 @@ ACTION_PAPER = Representation("trivial", "vector", "trivial", "trivial")
 MODES = {"strict": ACTION, "paper": ACTION_PAPER}
 
 
+def check_mode(mode: str) -> None:
+    """Checks the name of a mode.
+
+    Raises:
+        ValueError: It is neither ``"strict"`` nor ``"paper"``.
+    """
+    if mode not in MODES:
+        raise ValueError(f"mode={mode!r}: expected one of {', '.join(MODES)}")
+
+
 def action_representation(mode: str) -> Representation:
     """The action's representation in the networks of a mode.
 
@@ -40,8 +51,7 @@ def action_representation(mode: str) -> Representation:
     Raises:
         ValueError: Any other mode.
     """
-    if mode not in MODES:
-        raise ValueError(f"mode={mode!r}: expected one of {', '.join(MODES)}")
+    check_mode(mode)
     return MODES[mode]
 
 

@@ -165,12 +165,12 @@ def images_and_moves(rows: int = 20) -> TensorDict:
     return TensorDict({**data, "next": TensorDict({"pixels": data["pixels"] + 1}, [rows])}, [rows])
 
 
-def foreign_buffer(keys=("pixels", "move")) -> ReplayBuffer:
+def foreign_buffer(keys=("pixels", "move"), copies=4) -> ReplayBuffer:
     rules = {"pixels": ScalarField(), "move": Representation("vector")}
     return ReplayBuffer(
         storage=LazyTensorStorage(100),
         transform=RotationAugmentation(
-            4, spec=SymmetrySpec({key: rules[key] for key in keys}), generator=generator()
+            copies, spec=SymmetrySpec({key: rules[key] for key in keys}), generator=generator()
         ),
         batch_size=64,
     )
@@ -203,3 +203,6 @@ def test_what_cannot_be_turned_is_told():
     with pytest.raises(ValueError, match=r"pixels is of torch.uint8 .* ToTensorImage"):
         buffer.sample()
     foreign_buffer(keys=("move",)).extend(data)  # images that stay may be bytes
+    unturned = foreign_buffer(copies=0)
+    unturned.extend(data)
+    assert unturned.sample()["pixels"].dtype == torch.uint8

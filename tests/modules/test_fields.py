@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from equirl.modules import FieldType
+from equirl.modules import FieldType, SteerableLinear
 from equirl.symmetry import ACTION, Element, Representation, SymmetryGroup
 
 C2, C4, D2, D4, SO2, O2 = map(SymmetryGroup, ("C2", "C4", "D2", "D4", "SO2", "O2"))
@@ -124,7 +124,33 @@ def test_wrong_sizes_elements_and_groups_are_refused():
         FieldType.regular(D4, 1).transform(torch.zeros(7), FLIP)
     with pytest.raises(ValueError, match="not an element"):
         FieldType.regular(C4, 1).transform(torch.zeros(4), FLIP)
-    with pytest.raises(ValueError, match="SO2 has infinitely many elements"):
+    with pytest.raises(
+        ValueError, match="SO2 has no field 'regular': expected one of trivial, vec"
+    ):
         FieldType.regular(SO2, 1)
     with pytest.raises(ValueError, match="cannot add"):
         FieldType.regular(C4, 1) + FieldType.regular(D4, 1)
+
+
+@pytest.mark.parametrize(
+    ("group", "field"),
+    [
+        ("C4", "tirvial"),
+        ("C4", "sign"),  # trivial, without reflections
+        ("C4", "vector_2"),  # of a right angle it makes a half turn: two one-dimensional irreps
+        ("D3", "vector_2"),
+        ("C6", "vector_3"),
+        ("D2", "vector"),
+        ("D4", "vector_x"),
+        ("C2", "vector_y"),
+        ("O2", "regular"),
+    ],
+)
+def test_fields_that_a_group_does_not_have_are_refused(group, field):
+    with pytest.raises(ValueError, match=f"{group} has no field '{field}': expected one of"):
+        FieldType(SymmetryGroup(group), ("trivial", field))
+
+
+def test_vectors_of_higher_frequency_are_fields_of_large_enough_groups():
+    fields = FieldType(SymmetryGroup("D8"), ("vector_2", "vector_3"))
+    assert SteerableLinear(fields, fields).weights.shape == (2,)

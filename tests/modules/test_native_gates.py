@@ -111,7 +111,7 @@ def test_zero_windows_are_zero_with_finite_gradients(group, ties):
     assert x.grad.abs().max() > 0
 
 
-@pytest.mark.parametrize("size", [1e-8, 1.0, 1e6])
+@pytest.mark.parametrize("size", [1e-8, 1.0, 1e6, 1e12])
 def test_large_and_small_numbers(instruction_set, size):  # noqa: F811
     conv, gates = make_layer("O2", True, 2, 2, 1)
     x = size * torch.randn(3, conv.in_type.size, 8, 8)
@@ -122,7 +122,7 @@ def test_large_and_small_numbers(instruction_set, size):  # noqa: F811
 
 
 @pytest.mark.parametrize("block", [1, native.BLOCK])
-@pytest.mark.parametrize("ties", [None, "shared"])
+@pytest.mark.parametrize("ties", [None, "shared", "first"])
 def test_not_a_number_is_passed_on(instruction_set, ties, block):  # noqa: F811
     conv, gates = make_layer("SO2", True, 2, 2, 1)
     x = torch.randn(4, conv.in_type.size, 8, 8)

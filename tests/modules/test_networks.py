@@ -300,5 +300,5 @@ def test_wider_heads_leave_the_encoder_alone_and_values_invariant():
         {"depth": turn_image, "action": turn_action},
         case="wide critic",
     )
-    with pytest.raises(ValueError, match="head_width=0"):
+    with pytest.raises(ValueError, match="width of the heads, 0: expected a positive integer"):
         make_critic("D4", **SMALL, head_width=0)

@@ -73,7 +73,9 @@ def test_gradients_of_gates_are_derivatives():
 
 def test_a_relu_is_pointwise_and_for_permuted_channels_only():
     relu = FieldReLU(FieldType.regular(C4, 1) + FieldType.trivial(C4, 1))
-    assert relu(torch.tensor([-1.0, 2, -3, 4, -5])).tolist() == [0, 2, 0, 4, 0]
+    x = torch.tensor([-1.0, 2, -3, 4, -5])
+    assert relu(x).tolist() == [0, 2, 0, 4, 0]
+    assert x.tolist() == [-1, 2, -3, 4, -5]  # it is left alone
     assert relu.in_type == relu.out_type
     for fields in (FieldType.hidden(SO2, 1), FieldType(D4, ("regular", "sign"))):
         with pytest.raises(ValueError, match="a ReLU commutes with regular and trivial fields"):
@@ -83,6 +85,15 @@ def test_a_relu_is_pointwise_and_for_permuted_channels_only():
 def test_gates_of_regular_fields_are_refused():
     with pytest.raises(ValueError, match="irreducible fields"):
         GatedNonlinearity(FieldType.regular(D4, 2))
+
+
+def test_other_channels_are_refused():
+    for activation in (
+        FieldReLU(FieldType.regular(D4, 1)),
+        GatedNonlinearity(FieldType.hidden(SO2, 1)),
+    ):
+        with pytest.raises(ValueError, match="expected (8|11) channels in dimension 1 for"):
+            activation(torch.zeros(2, 9, 4, 4), dim=1)
 
 
 def test_the_group_chooses_the_activation():

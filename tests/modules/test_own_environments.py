@@ -127,6 +127,9 @@ def test_an_image_alone(group):
         ({"in_keys": "depth"}, "in_keys='depth'"),
         ({"in_keys": ["depth", "holding", "time"]}, "expected keys of an image and of its"),
         ({"invariants": 0}, "invariants=0: expected keys of an image alone"),
+        ({"action": "vector"}, "action='vector': expected a Representation"),
+        ({"action": Representation()}, "expected a Representation of one component or more"),
+        ({"mode": "exact"}, "mode='exact': expected one of strict, paper"),
     ],
 )
 def test_what_does_not_fit_is_named(make, own, message):

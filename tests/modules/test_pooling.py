@@ -121,7 +121,7 @@ def test_the_first_of_ties_breaks_the_symmetry_of_a_symmetric_map():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("scale", [0.0, 1e-12, 1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("scale", [0.0, 1e-12, 1e-6, 1.0, 1e6, 1e15])
 def test_gradients_are_finite_for_fields_of_any_size(scale, dtype):
     fields = FieldType.hidden(O2, 2)
     for pool in (NormMaxPool(fields), NormMaxPool(fields, "first"), NormPool(fields)):
@@ -131,6 +131,21 @@ def test_gradients_are_finite_for_fields_of_any_size(scale, dtype):
         (gradient,) = torch.autograd.grad(y.sum(), x)
         assert torch.isfinite(y).all() and torch.isfinite(gradient).all()
         assert gradient.abs().max() < 10
+
+
+def test_half_precision_neither_overflows_nor_divides_by_zero():
+    fields = FieldType.hidden(O2, 1)
+    for scale in (0.0, 1.0, 60.0):
+        x = (random_maps(fields) * scale).half()
+        y = NormMaxPool(fields)(x)
+        torch.testing.assert_close(y, NormMaxPool(fields)(x.double()).half(), atol=1e-2, rtol=1e-2)
+
+
+@pytest.mark.parametrize("ties", ["shared", "first"])
+def test_not_a_number_is_passed_on(ties):
+    fields = FieldType(O2, ("vector",))
+    x = window([3, 0], [float("nan"), 0], [0, 3], [1, 0])
+    assert NormMaxPool(fields, ties)(x).isnan().any()
 
 
 def test_gradients_are_derivatives():
@@ -157,8 +172,15 @@ def test_other_fields_ties_and_sizes_are_refused():
     with pytest.raises(ValueError, match="ties='last': expected shared or first"):
         NormMaxPool(hidden, ties="last")
     for shape in ((3, 4), (4, 3)):
-        with pytest.raises(ValueError, match="even height and width, got"):
-            NormMaxPool(hidden)(torch.zeros(1, 8, *shape))
+        for pool in (NormMaxPool(hidden), FieldMaxPool(FieldType.regular(D4, 1))):
+            with pytest.raises(ValueError, match="of even H and W, got"):
+                pool(torch.zeros(1, 8, *shape))
+    for pool in (NormMaxPool(hidden), FieldMaxPool(regular)):
+        with pytest.raises(ValueError, match="expected .* channels in dimension 1"):
+            pool(torch.zeros(1, 9, 4, 4))
+    for pool in (NormPool(hidden), GroupMaxPool(regular)):
+        with pytest.raises(ValueError, match="expected .* channels in dimension -1"):
+            pool(torch.zeros(2, 9))
 
 
 def test_the_group_and_the_mode_choose_the_pooling():

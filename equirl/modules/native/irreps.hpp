@@ -182,6 +182,15 @@ inline void squared_norms(const Vec* v, Vec* norms) {
     }
 }
 
+/// The largest of four squared norms of a part. Weights are relative to it, as it cancels and the
+/// fourth power of a norm may overflow.
+template <class Space>
+inline Vec largest_of(const Vec (*norms)[Space::irreps], int part) {
+    Vec largest = norms[0][part];
+    for (int q = 1; q < 4; ++q) largest = norms[q][part] > largest ? norms[q][part] : largest;
+    return largest;
+}
+
 /// Pools four fields.
 template <bool Mirror>
 inline void pool_vectors(int pool, const Vec (*v)[Gated<Mirror>::channels], Vec* pooled) {
@@ -192,15 +201,17 @@ inline void pool_vectors(int pool, const Vec (*v)[Gated<Mirror>::channels], Vec*
         if (pool == kMaximum) {
             Vec best[2] = {v[0][c], v[0][c + Space::dim[r] - 1]}, largest = norms[0][r];
             for (int q = 1; q < 4; ++q) {
-                const Mask better = mask(norms[q][r] > largest);
+                const Mask better = mask((norms[q][r] > largest) | (norms[q][r] != norms[q][r]));
                 largest = better ? norms[q][r] : largest;
                 for (int d = 0; d < Space::dim[r]; ++d) best[d] = better ? v[q][c + d] : best[d];
             }
             for (int d = 0; d < Space::dim[r]; ++d) pooled[c++] = best[d];
         } else {
             Vec weight[4], total = {};
+            const Vec scale = 1.0f / (largest_of<Space>(norms, r) + kEpsilon);
             for (int q = 0; q < 4; ++q) {
-                weight[q] = (norms[q][r] + kEpsilon) * (norms[q][r] + kEpsilon);
+                const Vec relative = (norms[q][r] + kEpsilon) * scale;
+                weight[q] = relative * relative;
                 total += weight[q];
             }
             const Vec inverse = 1.0f / total;
@@ -224,7 +235,7 @@ inline void unpool_vectors(int pool, const Vec (*v)[Gated<Mirror>::channels], co
             Mask chosen = {};
             Vec largest = norms[0][r];
             for (int q = 1; q < 4; ++q) {
-                const Mask better = mask(norms[q][r] > largest);
+                const Mask better = mask((norms[q][r] > largest) | (norms[q][r] != norms[q][r]));
                 largest = better ? norms[q][r] : largest;
                 chosen = better ? chosen - chosen + q : chosen;
             }
@@ -235,9 +246,10 @@ inline void unpool_vectors(int pool, const Vec (*v)[Gated<Mirror>::channels], co
             // With weights w = t / sum t, t = s^2 and s = |v|^2 + epsilon, and p the pooled vector:
             // dv = w (gradient + 4 v ((v - p) . gradient) / s).
             Vec share[4], dot[4], total = {}, mean = {};
+            const Vec scale = 1.0f / (largest_of<Space>(norms, r) + kEpsilon);
             for (int q = 0; q < 4; ++q) {
                 norms[q][r] += kEpsilon;
-                share[q] = norms[q][r] * norms[q][r];
+                share[q] = norms[q][r] * scale * (norms[q][r] * scale);
                 total += share[q];
                 dot[q] = v[q][c] * gradient[c];
                 if (Space::dim[r] == 2) dot[q] += v[q][c + 1] * gradient[c + 1];

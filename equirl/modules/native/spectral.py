@@ -7,8 +7,8 @@ alone. The weights of these independent maps are the spectral weights; they are 
 steerable ones. A finite group whose rotations contain the quarter turns is seen as its C4 or D4
 subgroup: a regular field is then several fields of the subgroup, one per coset.
 
-This module states which rows there are (the kernels compute them in the same order) and
-finds by least squares, in float64, how spectral weights follow from steerable ones.
+Which rows there are, in the order of the kernels, is stated in rows.py; this module finds by
+least squares, in float64, how spectral weights follow from steerable ones.
 """
 
 from __future__ import annotations

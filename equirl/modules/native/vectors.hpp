@@ -132,11 +132,13 @@ float* scratch(size_t floats) {
 
 /// Asks for large pages behind a new map. It is written once, and the kernel's work on small
 /// pages can take longer than the writing. Advice only: it may be refused without harm.
-inline void large_pages(void* start, size_t bytes) {
+inline void large_pages([[maybe_unused]] void* start, [[maybe_unused]] size_t bytes) {
+#if defined(MADV_HUGEPAGE)
     constexpr uintptr_t kPage = 4096;
     const uintptr_t first = (uintptr_t(start) + kPage - 1) & ~(kPage - 1);
     const uintptr_t last = (uintptr_t(start) + bytes) & ~(kPage - 1);
     if (bytes >= (size_t(4) << 20)) madvise(reinterpret_cast<void*>(first), last - first, MADV_HUGEPAGE);
+#endif
 }
 
 }  // namespace
