@@ -1,7 +1,7 @@
 """Measures how exactly the networks of a run have the symmetry, before and after training.
 
 python experiments/report.py run=outputs/demo
-python experiments/report.py run=outputs/demo group=d8 observations=16 output=outputs/demo_d8
+python experiments/report.py run=outputs/demo group=d8 observations=64 output=outputs/demo_d8
 
 Writes a page, a table and a picture of errors against the angle; docs/equivariance.md tells how to
 read them.
@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import math
 import sys
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -44,18 +45,25 @@ def main(job: ReportJob) -> None:
     config, state, learner = load_learner(job.run, job.device, job.backend)
     group = SymmetryGroup(job.group or config.group)
     folder = Path(job.output or job.run)
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        reports = measure(job, config, learner, observe(job, config, state), group)
-        page = describe(config, state["step"], group, reports)
+    reports = measure(job, config, learner, observe(job, config, state), group)
+    page, rows = describe(config, state["step"], group, reports), records(reports)
+    with writing(folder):
         write_atomically(folder / PAGE, page)
-        rows = records(reports)
         write_table(folder / TABLE, rows)
         plot_errors(rows, folder / PICTURE, title=f"Equivariance under {group.name}")
-    except OSError as error:
-        sys.exit(f"error: cannot write output={folder}: {error}")
     print(page)
     print(f"page: {folder / PAGE}")
+
+
+@contextmanager
+def writing(folder: Path) -> Iterator[None]:
+    """Within it, trouble with the disk ends the program in a sentence."""
+    try:
+        yield
+    except OSError as error:
+        sys.exit(f"error: cannot write output={folder}: {error}")
 
 
 def observe(job: ReportJob, config: Config, state: dict[str, Any]) -> dict[str, TensorDict]:
@@ -92,7 +100,8 @@ def measure(
     trained = (learner.policy, learner.critic)
     stages = {"before": make_networks(config), "after": trained}
     reports: dict[str, Reports] = {"policy": {}, "critic": {}}
-    with shared_filters(), tqdm(total=8, unit="report", leave=False) as bar:
+    shown = "{l_bar}{bar}| {elapsed}, {remaining} left"
+    with shared_filters(), tqdm(total=8, bar_format=shown, leave=False) as bar:
         for kind, seen in observations.items():
             for stage, networks in stages.items():
                 for of_network, network in zip(reports.values(), networks, strict=True):
@@ -102,9 +111,10 @@ def measure(
                         seen,
                         elements=elements_of(group, job.angles),
                         keep_theta=job.keep_theta,
+                        layers=job.layers,
                         seed=job.seed,
+                        progress=bar.update,
                     )
-                    bar.update(1)
     return reports
 
 

@@ -241,8 +241,9 @@ class ReportJob:
 
     run: str = MISSING  # the folder of a run
     group: str = ""  # whose elements are measured beside all angles; the run's own when empty
-    observations: int = at_least(64, 1)  # random ones, and as many from the run's replay buffer
+    observations: int = at_least(16, 1)  # random ones, and as many from the run's replay buffer
     angles: int = at_least(48, 1)  # turns measured, evenly spaced, beside those of the group
+    layers: bool = True  # measure each layer, too
     keep_theta: bool = False  # take theta for an invariant of reflections, as mode=paper does
     seed: int = at_least(0, 0)  # of the random observations and of the actions
     device: str = "auto"

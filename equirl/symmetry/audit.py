@@ -1,6 +1,7 @@
 """Does an environment have the symmetry? It is played against its own transformed copies.
 
-The copies are made by `audit_transforms`, which shares no code with what is checked here.
+The copies are made by `audit_transforms`, which shares no code with what is checked here but
+the group's elements.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """How audit and report turn images, actions, features and scenes: raw arrays, own arithmetic.
 
-No code is shared with what they check, nor with the representations that networks and replay
-buffers are built from. Everything is moved by any element; images exactly by those that map a
-square pixel grid onto itself, and by interpolation, on request, by the others.
+No code but the group's elements is shared with what they check, nor with the representations that
+networks and replay buffers are built from. Everything is moved by any element; images exactly by
+those that map a square pixel grid onto itself, and by interpolation, on request, by the others.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 from equirl.symmetry.groups import Element, SymmetryGroup
 
 __all__ = [
+    "ACTION_FIELDS",
     "displace_objects",
     "field_matrix",
     "interpolate_image",
@@ -25,6 +26,10 @@ __all__ = [
     "transform_image",
     "transform_scene",
 ]
+
+#: How an action of manipulation transforms: gripper, (x, y), z, theta.
+ACTION_FIELDS = ("trivial", "vector", "trivial", "sign")
+_O2 = SymmetryGroup("O2")
 
 
 def transform_image(image: np.ndarray, element: Element) -> np.ndarray:
@@ -65,12 +70,9 @@ def interpolate_image(image: np.ndarray, element: Element) -> np.ndarray:
 
 
 def transform_action(action: np.ndarray, element: Element, keep_theta: bool = False) -> np.ndarray:
-    """Moves (x, y) of an action (5,) and reverses theta under reflection unless ``keep_theta``."""
-    moved = action.copy()
-    moved[1:3] = _plane(element) @ action[1:3]
-    if element.reflected and not keep_theta:
-        moved[4] = -action[4]
-    return moved
+    """Moves actions (..., 5), theta left as it is if ``keep_theta``; of the same dtype."""
+    fields = [*ACTION_FIELDS[:-1], "trivial" if keep_theta else "sign"]
+    return transform_fields(action, fields, element, _O2).astype(action.dtype)
 
 
 def transform_deviations(

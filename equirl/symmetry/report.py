@@ -1,15 +1,16 @@
 """Does a network have the symmetry? Its outputs are compared with those for a moved picture.
 
 Pictures, actions and features are moved by `audit_transforms`, which shares no code with the
-networks.
+networks but the group's elements.
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -18,15 +19,14 @@ from tensordict import TensorDictBase
 from tensordict.nn import InteractionType, TensorDictModuleBase, set_interaction_type
 from torch import nn
 
+from equirl.symmetry.audit_transforms import ACTION_FIELDS
 from equirl.symmetry.groups import Element, SymmetryGroup
-from equirl.symmetry.report_layers import each_layer, find_layers
+from equirl.symmetry.report_layers import each_layer, find_layers, layer_elements
 from equirl.symmetry.report_outputs import ActionLaw, end_to_end, network_inputs
 from equirl.symmetry.report_result import EquivarianceReport, kind_of
+from equirl.symmetry.representations import Representation
 
-__all__ = ["ACTION_FIELDS", "equivariance_report"]
-
-#: How an action of manipulation transforms: gripper, (x, y), z, theta.
-ACTION_FIELDS = ("trivial", "vector", "trivial", "sign")
+__all__ = ["equivariance_report"]
 
 _BATCH = 16  # observations at a time: the features of all layers are held at once
 
@@ -37,10 +37,11 @@ def equivariance_report(
     observations: TensorDictBase,
     *,
     elements: Sequence[Element] | None = None,
-    action: Sequence[str] = ACTION_FIELDS,
+    action: Representation | Sequence[str] = ACTION_FIELDS,
     keep_theta: bool = False,
     layers: bool = True,
     seed: int = 0,
+    progress: Callable[[float], object] | None = None,
 ) -> EquivarianceReport:
     """Measures how far a policy or a critic is from commuting with a group.
 
@@ -52,9 +53,9 @@ def equivariance_report(
 
     Also after each steerable layer, which is any module with ``in_type`` and ``out_type``: its
     output for g s against that for s, its channels moved by the law of its fields and its pixels by
-    g. An error shows after the layer that makes it and after those that follow. Elements that do
-    not map the pixel grid onto itself are compared where one pixel is left, and elements outside of
-    a layer's group are not.
+    g. An error shows after the layer that makes it and after those that follow. This is done for
+    elements of the layer's group: all that map the pixel grid onto itself, and four others, under
+    which layers are compared only where one pixel is left. It runs on the dense backend.
 
     The network is left as it was, and so are the random generators. It is measured in the mode that
     it is in: call its ``eval()`` first where that matters.
@@ -67,18 +68,20 @@ def equivariance_report(
             pictures, whose rows grow with x and columns with y, all others invariants. A critic's
             ``action`` is random, within the unit disc in (x, y), if there is none.
         elements: Which to measure; those of the group if None, of SO(2) and O(2) some.
-        action: How each block of an action transforms: ``"trivial"``, ``"vector"`` for (x, y), or
-            ``"sign"`` for what changes its sign under reflections.
+        action: How an action transforms: a representation, or the names of its blocks:
+            ``"trivial"``, ``"vector"`` for (x, y), or ``"sign"`` for what changes its sign under
+            reflections. That of manipulation if left out.
         keep_theta: Whether theta, and any sign, is to be an invariant, as in the paper's networks.
         layers: Whether to measure the layers, too.
         seed: Of the actions that are drawn here.
+        progress: Told, after each piece of work, what share of the whole it was.
 
     Returns:
         The errors, with tables of them.
 
     Raises:
-        ValueError: The network is neither, the observations are not what it reads, or there is
-            nothing to measure.
+        ValueError: The network is neither, the observations are not what it reads, its action has
+            another size than ``action``, or there is nothing to measure.
 
     Example:
         >>> from equirl.modules import make_actor
@@ -92,21 +95,28 @@ def equivariance_report(
     elements = group.some_elements() if elements is None else tuple(elements)
     if not elements:
         raise ValueError("expected at least one element to measure, got none")
+    if isinstance(action, Representation):
+        action = [irrep.value for irrep in action.irreps]
     fields = tuple("trivial" if keep_theta and name == "sign" else name for name in action)
     law = ActionLaw(fields, group)
     inputs = network_inputs(network, observations, law, seed)
     watched, unmeasured = find_layers(network) if layers else ({}, ())
-    measured: dict[tuple[str, str, int], list[np.ndarray]] = defaultdict(list)
+    compared = layer_elements(watched, elements)
+    measured: dict[tuple[str, str, Element], list[np.ndarray]] = defaultdict(list)
+    batches = inputs.split(_BATCH)
     with _untouched(network, seed):
-        for batch in inputs.split(_BATCH):
-            for name, index, errors in end_to_end(network, batch, elements, law):
-                measured["end to end", name, index].append(errors)
-            for name, index, errors in each_layer(network, watched, batch, elements, law):
-                measured["layer", name, index].append(errors)
+        for batch in batches:
+            for level, element, errors in chain(
+                (("end to end", *found) for found in end_to_end(network, batch, elements, law)),
+                (("layer", *found) for found in each_layer(network, watched, batch, compared, law)),
+            ):
+                for name, error in errors.items():
+                    measured[level, name, element].append(error)
+                if progress:
+                    progress(1 / len(batches) / (len(elements) + len(compared)))
     records = []
-    for (level, name, index), batches in measured.items():
-        element = elements[index]
-        mean, largest, interpolated, size = np.concatenate(batches, axis=1)
+    for (level, name, element), parts in measured.items():
+        mean, largest, interpolated, size = np.concatenate(parts, axis=1)
         records.append(
             {
                 "level": level,

@@ -14,11 +14,12 @@ from torch import Tensor, nn
 
 from equirl.symmetry.audit_transforms import field_matrix, transform_fields, transform_image
 from equirl.symmetry.groups import Element, SymmetryGroup
-from equirl.symmetry.report_outputs import ActionLaw, as_array, moved_inputs, summary
+from equirl.symmetry.report_outputs import ActionLaw, Errors, as_array, moved_inputs, summary
 
-__all__ = ["each_layer", "find_layers"]
+__all__ = ["each_layer", "find_layers", "layer_elements"]
 
 _IDENTITY = Element(0.0)
+_OTHERS = 4  # elements that do not map the pixel grid, on which layers are compared
 
 
 def each_layer(
@@ -27,22 +28,38 @@ def each_layer(
     inputs: TensorDict,
     elements: Sequence[Element],
     law: ActionLaw,
-) -> Iterator[tuple[str, int, np.ndarray]]:
-    """Errors after each layer under each element of its group, as `summary` has them."""
-    groups = {layer.out_type.group for layer in layers.values()}
+) -> Iterator[tuple[Element, Errors]]:
+    """For each element the errors after the layers of whose group it is.
+
+    A layer that is called more than once has the errors of all calls side by side.
+    """
     with _recorded(network, layers) as outputs:
         network(inputs.copy())
         before = dict(outputs)
-        for index, element in enumerate(elements):
-            if not any(element in group for group in groups):
-                continue
+        for element in elements:
             outputs.clear()
             network(moved_inputs(inputs, element, law))
+            errors = {}
             for name, values in before.items():
-                for value, after in zip(values, outputs[name], strict=True):
-                    expected = _moved_features(value, element, layers[name].out_type)
-                    if expected is not None:
-                        yield name, index, summary(expected - after, value)
+                moved = [_moved_features(v, element, layers[name].out_type) for v in values]
+                calls = zip(moved, outputs[name], values, strict=True)
+                parts = [summary(m - after, value) for m, after, value in calls if m is not None]
+                if parts:
+                    errors[name] = np.concatenate(parts, axis=1)
+            yield element, errors
+
+
+def layer_elements(layers: dict[str, Any], elements: Sequence[Element]) -> list[Element]:
+    """Those under which layers are compared: all that map the pixel grid, then a few others.
+
+    Single layers run dense, which is slow, and under the others there is little to compare.
+    """
+    groups = {layer.out_type.group for layer in layers.values()}
+    moving = [g for g in elements if g.reflected or g.quarter_turns != 0]
+    own = [g for g in moving if any(g in group for group in groups)]
+    others = [g for g in own if not g.preserves_grid]
+    kept = {round(i) for i in np.linspace(0, len(others) - 1, _OTHERS)} if others else set()
+    return [g for g in own if g.preserves_grid] + [others[i] for i in sorted(kept)]
 
 
 def _moved_features(value: np.ndarray, element: Element, fields: Any) -> np.ndarray | None:
@@ -69,13 +86,26 @@ def find_layers(network: nn.Module) -> tuple[dict[str, Any], tuple[str, ...]]:
         and hasattr(module, "in_type")
         and hasattr(module, "out_type")
     }
-    # The paths into what TensorDict wraps say nothing: "module.0.module.encoder.layers.0".
-    short = {path: re.sub(r"^(module(\.\d+)?(\.|$))+", "", path) for path in found}
-    names = {path: short[path] or type(found[path]).__name__ for path in found}
+    names = {path: _short_name(path, found) for path in found}
     if len(set(names.values())) < len(names):
         names = {path: path for path in found}
     known = {names[path]: module for path, module in found.items() if _is_known(module.out_type)}
     return known, tuple(name for name in names.values() if name not in known)
+
+
+def _short_name(path: str, layers: dict[str, Any]) -> str:
+    """``"encoder.layers.0"`` for ``"module.0.module.encoder.layers.0"``.
+
+    The path into what TensorDict wraps says nothing. If what is wrapped there is a layer itself,
+    its class gives the name: ``"heads.hidden"`` of ``EquivariantQHeads``.
+    """
+    rest = re.sub(r"^(module(\.\d+)?(\.|$))+", "", path)
+    root = path.removesuffix(rest).rstrip(".")
+    if root not in layers:
+        return rest
+    kind = type(layers[root]).__name__
+    last_word = re.search(r"[A-Z]?[a-z0-9_]+$", kind)
+    return f"{(last_word[0] if last_word else kind).lower()}.{rest}".rstrip(".")
 
 
 def _is_known(fields: Any) -> bool:

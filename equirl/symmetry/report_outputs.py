@@ -21,10 +21,12 @@ from equirl.symmetry.audit_transforms import (
 )
 from equirl.symmetry.groups import Element, SymmetryGroup
 from equirl.symmetry.report_observations import random_actions
+from equirl.symmetry.representations import Representation
 
 __all__ = [
     "QUANTITIES",
     "ActionLaw",
+    "Errors",
     "as_array",
     "end_to_end",
     "moved_inputs",
@@ -38,6 +40,8 @@ QUANTITIES = ("mean", "sigma", "log-probability", "action", "Q")
 #: The outputs of a policy and of a critic that they are.
 _OUTPUTS = {"mean": "loc", "sigma": "scale", "action": "action", "Q": "state_action_value"}
 _ACTIONS = ("loc", "scale", "action")
+#: Of each quantity, or layer, what `summary` returns.
+Errors = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,18 @@ class ActionLaw:
         """Number of components."""
         return sum(len(field_matrix(field, _IDENTITY, self.group)) for field in self.fields)
 
+    def check(self, what: str, shape: Sequence[int]) -> None:
+        """Checks that ``what``, of this shape without the batch, has as many components.
+
+        Raises:
+            ValueError: It has not.
+        """
+        if tuple(shape) != (self.dim,):
+            raise ValueError(
+                f"action={' + '.join(self.fields)}: expected {what} of {self.dim} components, got "
+                f"shape {tuple(shape)}; say in action= how each block of it transforms"
+            )
+
     def move(self, action: np.ndarray, element: Element) -> np.ndarray:
         """Moves actions (..., dim)."""
         return transform_fields(action, self.fields, element, self.group)
@@ -68,23 +84,36 @@ class ActionLaw:
 
 def end_to_end(
     network: Any, inputs: TensorDict, elements: Sequence[Element], law: ActionLaw
-) -> Iterator[tuple[str, int, np.ndarray]]:
-    """Errors of each quantity under each element, as `summary` has them."""
+) -> Iterator[tuple[Element, Errors]]:
+    """For each element the errors of all quantities.
+
+    Raises:
+        ValueError: The network fails on the inputs, or its action is not of the law.
+    """
     actions = None
-    if hasattr(network, "get_dist") and "action" in network.out_keys:
-        actions = as_array(network.get_dist(inputs.copy()).sample())
-    before = _outputs(network, inputs, actions, law)
-    for index, element in enumerate(elements):
+    try:
+        if hasattr(network, "get_dist") and "action" in network.out_keys:
+            actions = as_array(network.get_dist(inputs.copy()).sample())
+        before = _outputs(network, inputs, actions, law)
+    except RuntimeError as error:
+        shapes = ", ".join(f"{key} {tuple(inputs[key].shape)}" for key in inputs.keys(True, True))
+        raise ValueError(
+            f"the network fails on observations of shapes {shapes}, with action="
+            f"{' + '.join(law.fields)}: {error}"
+        ) from error
+    for element in elements:
         moved_actions = None if actions is None else law.move(actions, element)
         after = _outputs(network, moved_inputs(inputs, element, law), moved_actions, law)
         again = None
         if not element.preserves_grid:
             again = _outputs(network, _there_and_back(inputs, element), actions, law)
+        errors = {}
         for name, value in before.items():
             expected = _expected(name, value, element, law)
             error = expected - _expected(name, after[name], _IDENTITY, law)
             change = None if again is None else value - again[name]
-            yield name, index, summary(error, value, change)
+            errors[name] = summary(error, value, change)
+        yield element, errors
 
 
 def _outputs(
@@ -96,11 +125,8 @@ def _outputs(
     for name, key in _OUTPUTS.items():
         if key in network.out_keys:
             found[name] = as_array(outputs.get(key))
-            if key in _ACTIONS and found[name].shape[1:] != (law.dim,):
-                raise ValueError(
-                    f"expected {key} (*batch, {law.dim}) for an action of {' + '.join(law.fields)},"
-                    f" got shape {found[name].shape}"
-                )
+            if key in _ACTIONS:
+                law.check(f"the network's {key}", found[name].shape[1:])
     if actions is not None:
         given = torch.from_numpy(actions).to(outputs.get("action"))
         log_probability = network.build_dist_from_params(outputs).log_prob(given)
@@ -152,7 +178,8 @@ def network_inputs(
     """What the network reads, in one batch dimension, where and in which floats it computes.
 
     Raises:
-        ValueError: The network is neither policy nor critic, or the observations are not for it.
+        ValueError: The network is neither policy nor critic, the observations are not for it, or
+            it takes other actions.
     """
     written = getattr(network, "out_keys", ())
     if not set(written) & set(_OUTPUTS.values()):
@@ -175,6 +202,12 @@ def network_inputs(
             value = value.reshape(count, *value.shape[observations.batch_dims :])
         if value.ndim == 4 and value.shape[-1] != value.shape[-2]:
             raise ValueError(f"expected square pictures, got {key} of shape {tuple(value.shape)}")
+        if key == "action":
+            law.check("the observations' action", value.shape[1:])
+            for head in network.modules():
+                taken = getattr(head, "in_rep", None)
+                if isinstance(taken, Representation):
+                    law.check("the network's action", (taken.dim,))
         inputs.set(key, value)
     parameter = next(network.parameters(), torch.zeros(()))
     inputs = inputs.to(parameter.device)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -13,7 +13,15 @@ import numpy as np
 from equirl.symmetry.audit_result import markdown_table
 from equirl.symmetry.groups import Element, SymmetryGroup
 
-__all__ = ["EquivarianceReport", "Kind", "error_table", "kind_of", "layer_table"]
+__all__ = [
+    "BETWEEN",
+    "ON_GRID",
+    "EquivarianceReport",
+    "Kind",
+    "error_table",
+    "kind_of",
+    "layer_table",
+]
 
 
 class Kind(StrEnum):
@@ -27,9 +35,12 @@ class Kind(StrEnum):
     OUTSIDE = "outside the group"
 
 
-_GRID = (Kind.GRID_TURN, Kind.GRID_REFLECTION)
-_OTHER = (Kind.OTHER_TURN, Kind.OTHER_REFLECTION)
+#: Kinds of elements of the group: those that map the pixel grid onto itself, and the others.
+ON_GRID = (Kind.GRID_TURN, Kind.GRID_REFLECTION)
+BETWEEN = (Kind.OTHER_TURN, Kind.OTHER_REFLECTION)
 _MOVING = tuple(kind for kind in Kind if kind is not Kind.IDENTITY)
+#: What there is in columns that are known beforehand.
+_VALUES = {"kind": tuple(Kind), "level": ("end to end", "layer")}
 
 
 def kind_of(element: Element, group: SymmetryGroup) -> Kind:
@@ -73,24 +84,47 @@ class EquivarianceReport:
 
         Args:
             conditions: For columns of `rows`, a value or a tuple of values.
+
+        Raises:
+            ValueError: There is no such column, kind or level.
         """
+        for column, values in conditions.items():
+            _check("column", (column,), self.rows)
+            if column in _VALUES:
+                _check(column, (values,) if isinstance(values, str) else values, _VALUES[column])
         chosen = np.ones(len(self.rows["name"]), dtype=bool)
         for column, values in conditions.items():
             chosen &= np.isin(self.rows[column], values)
         return {column: values[chosen] for column, values in self.rows.items()}
 
     def error(self, name: str, **conditions: Any) -> tuple[float, float]:
-        """Returns mean and largest error of a quantity or layer; nan if nothing was measured.
+        """Returns mean and largest error of a quantity or layer; nan where nothing was measured.
 
         Args:
             name: A quantity (``"mean"``, ``"sigma"``, ``"log-probability"``, ``"action"``, ``"Q"``)
                 or a layer.
             conditions: As for `select`; without a ``kind``, all elements but the identity.
+
+        Raises:
+            ValueError: There is no such name, column, kind or level.
         """
+        _check("name", (name,), dict.fromkeys(self.rows["name"].tolist()))
         rows = self.select(name=name, **{"kind": _MOVING, **conditions})
         if not len(rows["mean"]):
             return math.nan, math.nan
         return float(rows["mean"].mean()), float(rows["max"].max())
+
+    def there_and_back(self, name: str) -> float:
+        """Returns a quantity's mean change when pictures are turned there and back.
+
+        It is nan where all elements map the pixel grid onto itself.
+
+        Args:
+            name: A quantity.
+        """
+        changes = self.select(level="end to end", name=name)["interpolated"]
+        changes = changes[~np.isnan(changes)]
+        return float(changes.mean()) if len(changes) else math.nan
 
     def names(self, level: str) -> list[str]:
         """Returns the quantities, or the layers in the order of their calls."""
@@ -127,6 +161,13 @@ class EquivarianceReport:
         return remarks
 
 
+def _check(what: str, wanted: Iterable[str], known: Iterable[str]) -> None:
+    known = tuple(known)
+    for value in wanted:
+        if value not in known:
+            raise ValueError(f"{what}={value!r}: expected one of {', '.join(known)}")
+
+
 def error_table(reports: Mapping[str, EquivarianceReport]) -> str:
     """Returns the errors end to end, mean and largest, as Markdown.
 
@@ -144,7 +185,7 @@ def error_table(reports: Mapping[str, EquivarianceReport]) -> str:
             errors = [_cell(*report.error(name, level="end to end", kind=kind)) for kind in kinds]
             row = [name, *([label] * labelled), size, *errors]
             if between:
-                row.append(_number(_interpolated(report, name)))
+                row.append(_number(report.there_and_back(name)))
             rows.append(row)
     return markdown_table(header + ["there and back"] * between, rows)
 
@@ -158,7 +199,7 @@ def layer_table(reports: Mapping[str, EquivarianceReport]) -> str:
     first, rows = next(iter(reports.values())), []
     for name in first.names("layer"):
         fields = str(first.select(level="layer", name=name)["fields"][0])
-        for place, kinds in (("on the grid", _GRID), ("others", _OTHER)):
+        for place, kinds in (("on the grid", ON_GRID), ("others", BETWEEN)):
             where: dict[str, Any] = {"level": "layer", "name": name, "kind": kinds}
             if not len(first.select(**where)["mean"]):
                 continue
@@ -168,13 +209,6 @@ def layer_table(reports: Mapping[str, EquivarianceReport]) -> str:
             ]
             rows.append([name, fields, place, *cells])
     return markdown_table(["layer", "fields", "elements", *reports], rows)
-
-
-def _interpolated(report: EquivarianceReport, name: str) -> float:
-    """The mean change when the picture is turned there and back, where that is not exact."""
-    changes = report.select(level="end to end", name=name)["interpolated"]
-    changes = changes[~np.isnan(changes)]
-    return float(changes.mean()) if len(changes) else math.nan
 
 
 def _cell(mean: float, largest: float) -> str:

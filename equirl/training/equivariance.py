@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from equirl.data import QuantizeDepth
 from equirl.modules import shared_filters
 from equirl.symmetry import SymmetryGroup, equivariance_report
+from equirl.symmetry.report_result import BETWEEN, ON_GRID
 
 __all__ = ["replay_observations", "symmetry_errors"]
 
@@ -43,9 +44,12 @@ def replay_observations(rows: TensorDictBase, max_depth: float, count: int) -> T
 def symmetry_errors(
     networks: Sequence[TensorDictModuleBase], group: str, observations: TensorDictBase
 ) -> dict[str, float]:
-    """Mean and largest error of each quantity over the elements of a group but the identity.
+    """Mean and largest error of each quantity under a group, on the pixel grid and between.
 
-    Of SO(2) and O(2) the elements are the eighth turns, with and without reflection.
+    On the grid are the elements that map it onto itself, but the identity: what errs there is the
+    network. Between are the other elements, of SO(2) and O(2) the other eighth turns, with and
+    without reflection: there the picture is interpolated as well, and how much that does by itself
+    is told by turning it there and back.
 
     Args:
         networks: Policies and critics, of different quantities.
@@ -53,7 +57,9 @@ def symmetry_errors(
         observations: What the networks read.
 
     Returns:
-        ``mean``, ``mean_max``, ``sigma``, and so on, as in ``symmetry.csv``.
+        For ``mean``, ``sigma`` and so on: ``mean_grid`` and ``mean_grid_max``, ``mean_between``
+        and ``mean_between_max``, and ``mean_back``, as in ``symmetry.csv``; nan where the group has
+        no such elements.
     """
     errors, elements = {}, SymmetryGroup(group).some_elements(8)
     for network in networks:
@@ -63,5 +69,8 @@ def symmetry_errors(
             )
         for name in report.names("end to end"):
             column = _COLUMNS[name]
-            errors[column], errors[f"{column}_max"] = report.error(name)
+            for place, kinds in (("grid", ON_GRID), ("between", BETWEEN)):
+                mean, largest = report.error(name, kind=kinds)
+                errors[f"{column}_{place}"], errors[f"{column}_{place}_max"] = mean, largest
+            errors[f"{column}_back"] = report.there_and_back(name)
     return errors

@@ -65,10 +65,12 @@ def test_page_table_and_picture(here, folder):
 
 def test_the_papers_theta_and_another_group_and_folder(here, folder, tmp_path):
     output = tmp_path / "new" / "page"
-    keys = ["observations=2", "angles=2", "keep_theta=true", "group=c8", f"output={output}"]
+    keys = ["observations=2", "angles=2", "keep_theta=true", "group=c8", "layers=false"]
+    keys.append(f"output={output}")
     code, out, err = here("report.py", f"run={folder}", *keys)
     assert code == 0, err
     assert "C8, 8 elements, 2 observations, actions trivial + vector + trivial + trivial." in out
+    assert {row["level"] for row in table(output)} == {"end to end"} and "| layer |" not in out
     assert len({row["angle"] for row in table(output)}) == 8
     assert {row["reflected"] for row in table(output)} == {"False"}
 
@@ -87,6 +89,15 @@ def test_the_papers_theta_and_another_group_and_folder(here, folder, tmp_path):
 def test_bad_input_ends_in_a_sentence_that_names_it(here, folder, arguments, named):
     code, _, err = here("report.py", f"run={folder}", *arguments)
     assert code == 1 and named in err and "Traceback" not in err
+
+
+def test_only_writing_is_called_trouble_with_the_disk(here, folder, monkeypatch):
+    def fails(*args, **kwargs):
+        raise OSError("no library here")
+
+    monkeypatch.setattr("equirl.symmetry.equivariance_report", fails)
+    with pytest.raises(OSError, match="no library here"):
+        here("report.py", f"run={folder}", "observations=1", "angles=1")
 
 
 def test_a_folder_without_a_run(here, tmp_path):
