@@ -31,18 +31,39 @@ def main(given: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("file", type=Path)
     policy, certificate = load(parser.parse_args(given).file)
+    built_in = certificate["group"] and f"group {certificate['group']}, mode {certificate['mode']}"
     print(
         f"{certificate['method']} policy of {certificate['task']}, "
-        f"group {certificate['group']}, mode {certificate['mode']}; certified to turn exactly: "
-        f"{'yes' if certificate['exact'] else 'no'}"
+        f"{built_in or 'no symmetry built in'}"
     )
+    measured = certificate["symmetry"]["physical"]
+    print(certified(measured))
+    meanings = certificate["outputs"]["action"]["components"]
     depth = block(certificate["image"])
     action = policy(depth, False)
-    print("scene as it is       ", shown(action))
-    for turns in (1, 2, 3):
-        after = policy(np.rot90(depth, turns), False)
-        error = np.abs(after - turned(action, turns)).max()
-        print(f"turned by {90 * turns:3d} degrees", shown(after), f" off by {error:.1e}")
+    print(f"{'scene as it is':<24}", shown(action, meanings))
+    for element in measured["errors"]:
+        if element["on_grid"]:
+            turns, reflected = round(element["degrees"] / 90), element["reflected"]
+            picture = np.rot90(depth[:, ::-1] if reflected else depth, turns)
+            after = policy(picture, False)
+            error = np.abs(after - turned(action, turns, reflected)).max()
+            name = f"turned: {element['element']}"
+            print(f"{name:<24}", shown(after, meanings), f" off by {error:.1e}")
+
+
+def certified(measured: dict[str, Any]) -> str:
+    """Returns what the certificate says of the action, in a sentence."""
+    exact, between = measured["exact_on_grid"]["action"], measured["between"]
+    text = f"{'exact' if exact else 'not exact'} at the turns that map pixels onto pixels"
+    if between:
+        error = between["action"]
+        text += (
+            f"; between them the action errs by {error['mean']:.1e} in the mean, "
+            f"{error['largest']:.1e} at most (turning the picture there and back: "
+            f"{error['there_and_back']:.1e})"
+        )
+    return text
 
 
 def load(path: Path) -> tuple[Policy, dict[str, Any]]:
@@ -80,20 +101,25 @@ def block(image: dict[str, Any]) -> np.ndarray:
     return np.where(on_top, 0.15, 0.20)
 
 
-def turned(action: np.ndarray, turns: int) -> np.ndarray:
-    """Returns an action (5,) after quarter turns of the scene: x and y turn, the rest stays."""
+def turned(action: np.ndarray, turns: int, reflected: bool) -> np.ndarray:
+    """Returns an action (5,) after y was reversed, or not, and then quarter turns of the scene."""
     gripper, x, y, z, theta = action
-    cos, sin = ((1, 0), (0, 1), (-1, 0), (0, -1))[turns]
-    return np.array([gripper, cos * x - sin * y, sin * x + cos * y, z, theta])
+    if reflected:
+        y, theta = -y, -theta
+    for _ in range(turns):
+        x, y = -y, x
+    return np.array([gripper, x, y, z, theta])
 
 
-def shown(action: np.ndarray) -> str:
-    """Returns an action (5,) in words."""
-    x, y, z = 1000 * 0.05 * action[1:4]
-    opening, turn = 1000 * 0.08 * (action[0] + 1) / 2, math.degrees(math.pi / 4 * action[4])
+def shown(action: np.ndarray, meanings: dict[str, Any]) -> str:
+    """Returns an action (5,) in words, in the units of the certificate."""
+    gripper, x, y, z, theta = (
+        m["low"] + (number + 1) / 2 * (m["high"] - m["low"])
+        for number, m in zip(action, meanings.values(), strict=True)
+    )
     return (
-        f"move ({x:+6.1f}, {y:+6.1f}, {z:+6.1f}) mm, turn {turn:+6.1f} degrees, "
-        f"fingers {opening:4.1f} mm apart"
+        f"move ({1000 * x:+6.1f}, {1000 * y:+6.1f}, {1000 * z:+6.1f}) mm, "
+        f"turn {math.degrees(theta):+6.1f} degrees, fingers {1000 * gripper:4.1f} mm apart"
     )
 
 

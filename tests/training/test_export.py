@@ -1,8 +1,7 @@
 """Exported policies: they do what the policy does, and say truly whether they turn."""
 
 import json
-import subprocess
-import sys
+import math
 import zipfile
 from pathlib import Path
 
@@ -17,9 +16,7 @@ from equirl.envs.action import Action
 from equirl.training import (
     ExportError,
     check_exported,
-    export_actor,
     load_exported,
-    make_networks,
     read_certificate,
 )
 from equirl.training.export import exporting, formats, frozen, summary
@@ -29,28 +26,6 @@ from tests.equivariance import assert_equivariant, turn_action, turn_image
 
 ROOT = Path(__file__).parents[2]
 SUFFIXES = [".pt2", ".onnx"]
-CASES = {
-    "C4": {"group": "C4"},
-    "C8": {"group": "C8"},
-    "D4": {"group": "D4"},
-    "O2": {"group": "O2", "backend": "dense"},
-    "D4 paper": {"group": "D4", "mode": "paper"},
-    "CNN": {"method": {"name": "cnn"}},
-}
-
-
-@pytest.fixture
-def export(small_config, tmp_path):
-    """Exports an untrained policy: its actor, its certificate and its file."""
-
-    def call(suffix: str, case: str = "D4", **options):
-        torch.manual_seed(0)
-        config = small_config(device="cpu", **CASES[case])
-        actor, _ = make_networks(config)
-        path = tmp_path / f"policy{suffix}"
-        return actor, export_actor(config, actor, path, steps=7, **options), path
-
-    return call
 
 
 def assert_same(policy, actor):
@@ -68,7 +43,15 @@ def assert_same(policy, actor):
 
 @pytest.mark.parametrize(
     ("case", "suffix"),
-    [("D4", ".pt2"), ("D4", ".onnx"), ("C4", ".pt2"), ("C8", ".onnx"), ("O2", ".onnx")],
+    [
+        ("D4", ".pt2"),
+        ("D4", ".onnx"),
+        ("C4", ".pt2"),
+        ("C8", ".onnx"),
+        ("D8", ".pt2"),
+        ("SO2", ".pt2"),
+        ("O2", ".onnx"),
+    ],
 )
 def test_equivariant_policies_are_certified(export, case, suffix):
     actor, certificate, path = export(suffix, case, observations=24)
@@ -76,7 +59,7 @@ def test_equivariant_policies_are_certified(export, case, suffix):
     assert_same(policy, actor)
     assert max(certificate["difference"].values()) < 5e-6
     assert certificate == read_certificate(path) == json.loads(json.dumps(certificate))
-    assert certificate["exact"] and "Not exact" not in summary(certificate)
+    assert certificate["exact_on_grid"] and "Not exact" not in summary(certificate)
 
     def act(depth, holding):
         out = policy(np.ascontiguousarray(depth.numpy()), holding.numpy())
@@ -84,17 +67,46 @@ def test_equivariant_policies_are_certified(export, case, suffix):
 
     turned = {"depth": turn_image, "action": turn_action, "loc": turn_action}
     inputs = {"depth": 0.3 * torch.rand(4, 1, 16, 16), "holding": torch.ones(4, 1)}
-    group = {"C8": "C4", "O2": "D4"}.get(case, case)
-    assert_equivariant(act, group, inputs, turned, case=case, tolerance=5e-6)
+    assert_equivariant(act, case, inputs, turned, case=case, tolerance=5e-6)
+
+
+def test_errors_between_pixels_are_measured_and_said(export):
+    _, certificate, _ = export(".pt2", "C8", observations=12)
+    found = certificate["symmetry"]["physical"]
+    degrees = {on_grid: [] for on_grid in (True, False)}
+    for row in found["errors"]:
+        degrees[row["on_grid"]].append(row["degrees"])
+    assert degrees == {True: [90, 180, 270], False: [45, 135, 225, 315]}
+    for name, error in found["between"].items():
+        rows = [row[name] for row in found["errors"] if not row["on_grid"]]
+        assert error["largest"] == max(row["largest"] for row in rows) > 1e-3
+        assert 1e-4 < error["mean"] < error["largest"]
+        assert error["there_and_back"] > 1e-4 and error["size"] > 1e-2
+    error = found["between"]["action"]
+    page = summary(certificate)
+    assert "that map pixels onto pixels: action, loc, scale. Between them the action" in page
+    assert f"errs by {error['mean']:.1e} in the mean and {error['largest']:.1e} at most" in page
+    assert "| 4 others of C8 |" in page
+
+
+def test_of_groups_with_many_elements_some_are_measured(export):
+    _, certificate, path = export(".pt2", "C4", observations=3)
+    assert certificate["symmetry"]["physical"]["between"] is None
+    assert "Between" not in summary(certificate) and "others" not in summary(certificate)
+    seen = make_observations(1, 16, 0.32)
+    found = measure(load_exported(path), seen, certificate["tolerance"], "D100", "strict")
+    on_grid = [row["on_grid"] for row in found["symmetry"]["physical"]["errors"]]
+    assert on_grid.count(True) == 7 and on_grid.count(False) == 8
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_a_policy_without_symmetry_says_so(export, suffix):
     actor, certificate, path = export(suffix, "CNN", observations=24)
     assert_same(load_exported(path), actor)
-    assert certificate["group"] is None and not certificate["exact"]
+    assert certificate["group"] is None and not certificate["exact_on_grid"]
     found = certificate["symmetry"]["physical"]
-    assert not any(found["exact"].values()) and min(row["action"] for row in found["errors"]) > 1e-3
+    assert not any(found["exact_on_grid"].values()) and found["between"] is None
+    assert min(row["action"]["largest"] for row in found["errors"]) > 1e-3
     assert "Not exact under the turns of D4" in summary(certificate)
     assert "no symmetry built in" in summary(certificate)
 
@@ -103,12 +115,21 @@ def test_the_papers_policy_says_under_what_it_is_exact(export):
     actor, certificate, path = export(".pt2", "D4 paper", observations=24)
     assert_same(load_exported(path), actor)
     symmetry = certificate["symmetry"]
-    assert not certificate["exact"] and all(symmetry["paper"]["exact"].values())
+    assert not certificate["exact_on_grid"] and all(symmetry["paper"]["exact_on_grid"].values())
     for row in symmetry["physical"]["errors"]:
-        assert ("y reversed" in row["element"]) == (row["action"] > 1e-3)  # the sign of theta
-        assert ("90" in row["element"] or "270" in row["element"]) == (row["scale"] > 1e-3)
+        assert row["reflected"] == ("y reversed" in row["element"])
+        assert row["reflected"] == (row["action"]["largest"] > 1e-3)  # the sign of theta
+        assert (row["degrees"] in (90, 270)) == (row["scale"]["largest"] > 1e-3)
     page = summary(certificate)
     assert page.index("Not exact under the turns of D4") < page.index("Exact up to rounding")
+
+
+@pytest.mark.parametrize("case", ["SO2 paper", "O2 paper"])
+def test_where_ties_are_broken_by_order_nothing_is_exact(export, case):
+    actor, certificate, path = export(".pt2", case, observations=12)
+    assert_same(load_exported(path), actor)
+    for found in certificate["symmetry"].values():
+        assert not any(found["exact_on_grid"].values()) and found["between"]
 
 
 def test_the_certificate_says_what_goes_in_and_out(export):
@@ -117,8 +138,11 @@ def test_the_certificate_says_what_goes_in_and_out(export):
     assert facts.items() <= certificate.items()
     assert certificate["image"]["side_m"] == 0.3 and certificate["image"]["pixels"] == 16
     assert certificate["inputs"]["depth"]["shape"] == ["batch", 1, 16, 16]
-    meaning = certificate["outputs"]["action"]["meaning"]
-    assert list(meaning) == list(Action._fields) and "0.785398 rad" in meaning["theta"]
+    components = certificate["outputs"]["action"]["components"]
+    assert list(components) == list(Action._fields)
+    ranges = {name: (c["low"], c["high"], c["unit"]) for name, c in components.items()}
+    assert ranges["gripper"] == (0, 0.08, "m") and ranges["x"] == ranges["z"] == (-0.05, 0.05, "m")
+    assert ranges["theta"] == (-math.pi / 4, math.pi / 4, "rad")
     assert certificate["batches"] == [1, 2, 3, 64] == batch_sizes(70)
     assert len(certificate["symmetry"]["physical"]["errors"]) == 7
     with zipfile.ZipFile(path) as archive:
@@ -142,8 +166,9 @@ def test_without_turns_of_the_grid_nothing_is_certified(export):
     _, certificate, path = export(".pt2", observations=3)
     seen = make_observations(3, 16, 0.32)
     found = measure(load_exported(path), seen, certificate["tolerance"], "C3", "strict")
-    assert not found["exact"]
-    assert "Nothing is certified: no turn of C3" in summary(certificate | found)
+    assert not found["exact_on_grid"] and found["symmetry"]["physical"]["between"]
+    page = summary(certificate | found)
+    assert "Nothing is certified as exact: no turn of C3 maps pixels onto pixels. At those" in page
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
@@ -177,7 +202,7 @@ def test_a_policy_that_is_not_finite_is_refused(export, monkeypatch, tmp_path):
 def test_a_file_changed_later_is_found_out(export):
     onnx = pytest.importorskip("onnx")
     _, certificate, path = export(".onnx")
-    assert check_exported(path, observations=20)["exact"] and certificate["exact"]
+    assert check_exported(path, observations=20)["exact_on_grid"] and certificate["exact_on_grid"]
     model = onnx.load(path)
     for weight in model.graph.initializer:
         if weight.name.endswith("head.weight"):
@@ -202,6 +227,29 @@ def test_what_is_no_policy_is_named(suffix, tmp_path):
             read(path)
 
 
+def test_a_certificate_that_lacks_something_is_refused(export):
+    _, certificate, path = export(".pt2", "C4", observations=3)
+    program = torch.export.load(path)
+
+    def rewritten(**changes):
+        text = json.dumps(certificate | changes)
+        torch.export.save(program, path, extra_files={formats.CERTIFICATE: text})
+        return path
+
+    assert check_exported(rewritten(), observations=3)["exact_on_grid"]
+    for changes, lacking in {
+        "tolerance": {"action": 1e-5, "loc": 1e-5},
+        "image": {"pixels": "sixteen", "side_m": 0.3, "max_depth_m": 0.32},
+        "symmetry": {},
+        "group": 4,
+    }.items():
+        with pytest.raises(ExportError, match=rf"certificate lacks {changes}") as raised:
+            check_exported(rewritten(**{changes: lacking}))
+        assert "KeyError" not in str(raised.value)
+    with pytest.raises(ExportError, match="not of format 1"):
+        read_certificate(rewritten(format=2))
+
+
 def test_names_folders_and_packages_are_checked_first(export, monkeypatch, tmp_path):
     with pytest.raises(ExportError, match=r"policy\.pth: expected .* ends in \.pt2 or \.onnx"):
         export(".pth")
@@ -221,45 +269,3 @@ def test_observations_are_stored_ones_and_drawn_ones():
     assert len(make_observations(4, 16, 0.32, stored).depth) == 4
     assert seen.depth.dtype == np.float32 and 0 <= seen.depth.min() <= seen.depth.max() <= 0.33
     assert sum(batch_sizes(200)) == 200 and batch_sizes(2) == [1, 1]
-
-
-#: Makes a process in which what follows cannot be imported.
-GUARD = """
-import sys
-class Guard:
-    def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in {absent!r}:
-            raise ImportError("not installed here: " + name)
-sys.meta_path.insert(0, Guard())
-"""
-TORCH_ALONE = """
-import json, torch
-texts = {"certificate.json": ""}
-policy = torch.export.load("policy.pt2", extra_files=texts).module()
-action, loc, scale = policy(torch.rand(5, 1, 16, 16), torch.zeros(5, 1))
-assert action.shape == (5, 5) and json.loads(texts["certificate.json"])["group"] == "D4"
-"""
-NUMPY_ALONE = f"""
-import runpy
-sys.argv = ["run_exported.py", "policy.onnx"]
-runpy.run_path({str(ROOT / "experiments" / "run_exported.py")!r}, run_name="__main__")
-"""
-
-
-@pytest.mark.parametrize(
-    ("suffix", "code", "absent"),
-    [
-        (".pt2", TORCH_ALONE, ["torchrl", "tensordict", "escnn", "equirl"]),
-        (".onnx", NUMPY_ALONE, ["torch", "torchrl", "tensordict", "escnn", "equirl", "onnx"]),
-    ],
-    ids=["torch", "numpy"],
-)
-def test_files_run_where_equirl_is_not(export, suffix, code, absent):
-    _, _, path = export(suffix)
-    command = [sys.executable, "-c", GUARD.format(absent=absent) + code]
-    done = subprocess.run(command, cwd=path.parent, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    if suffix == ".onnx":
-        assert "certified to turn exactly: yes" in done.stdout
-        errors = [float(line.split("off by ")[1]) for line in done.stdout.splitlines()[2:]]
-        assert len(errors) == 3 and max(errors) < 1e-5

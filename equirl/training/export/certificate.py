@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from importlib.metadata import version
 from typing import Any
 
@@ -19,8 +20,7 @@ from equirl.training.export.measures import (
     PAPER,
     PHYSICAL,
     Observations,
-    answers,
-    batch_sizes,
+    remembered,
     turning_errors,
 )
 
@@ -29,6 +29,8 @@ __all__ = ["describe_policy", "image_of", "measure", "summary"]
 _FORMAT = 1
 #: The symmetry of the simulated tasks, which policies without any are measured against.
 _TASK_GROUP = "D4"
+#: At so many elements between those of the pixel grid it is measured, or fewer.
+_MOST_BETWEEN = 8
 
 
 def image_of(config: Config) -> HeightmapSpec:
@@ -87,13 +89,14 @@ def describe_policy(config: Config, actor: ProbabilisticActor, steps: int) -> di
                 "shape": ["batch", 5],
                 "type": "float32",
                 "unit": "1",
-                "meaning": {
-                    "gripper": f"from -1 to 1: the fingers {opening:g} m (u + 1) / 2 apart",
-                    "x": f"from -1 to 1: a displacement of {step:g} m u along world x",
-                    "y": f"from -1 to 1: a displacement of {step:g} m u along world y",
-                    "z": f"from -1 to 1: a displacement of {step:g} m u upwards",
-                    "theta": f"from -1 to 1: a turn of {turn:.6g} rad u about the vertical, "
-                    "from x to y",
+                "meaning": "numbers from -1 to 1; what each stands for grows evenly with it, from "
+                "`low` at -1 to `high` at 1, in `unit`",
+                "components": {
+                    "gripper": _component("distance between the fingers", "m", 0.0, opening),
+                    "x": _component("displacement along world x", "m", -step, step),
+                    "y": _component("displacement along world y", "m", -step, step),
+                    "z": _component("displacement upwards", "m", -step, step),
+                    "theta": _component("turn about the vertical, x to y", "rad", -turn, turn),
                 },
             },
             "loc": {
@@ -116,6 +119,10 @@ def describe_policy(config: Config, actor: ProbabilisticActor, steps: int) -> di
     }
 
 
+def _component(meaning: str, unit: str, low: float, high: float) -> dict[str, Any]:
+    return {"meaning": meaning, "unit": unit, "low": float(low), "high": float(high)}
+
+
 def measure(
     policy: Policy,
     observations: Observations,
@@ -134,29 +141,45 @@ def measure(
             declare.
 
     Returns:
-        The part of a certificate that is about symmetry. ``exact`` holds only if every output
-        turns as in the world, up to rounding.
+        The part of a certificate that is about symmetry. ``exact_on_grid`` holds only if every
+        output turns as in the world, up to rounding, by the elements that map pixels onto pixels;
+        ``between`` has the errors by others, None for a group that has no others.
     """
     measured = SymmetryGroup(group or _TASK_GROUP)
-    elements = [g for g in measured.grid_elements if g != Element(0.0)]
+    elements = _measured_elements(measured)
     rules = [PHYSICAL, PAPER] if group and mode == PAPER else [PHYSICAL]
-    before = answers(policy, observations)
+    policy = remembered(policy)  # rules differ in what is expected alone
     symmetry: dict[str, Any] = {}
-    errors = turning_errors(policy, observations, before, elements, rules)
-    for rule, rows in errors.items():
+    for rule in rules:
+        rows = turning_errors(policy, observations, measured, elements, rule)
+        grid = [row for row in rows if row["on_grid"]]
+        between = [row for row in rows if not row["on_grid"]]
         exact = {
-            name: bool(rows) and all(float(row[name]) <= tolerance[name] for row in rows)
+            name: bool(grid) and all(row[name]["largest"] <= tolerance[name] for row in grid)
             for name in OUTPUTS
         }
-        symmetry[rule] = {"errors": rows, "exact": exact}
+        over = {name: _together([row[name] for row in between]) for name in OUTPUTS if between}
+        symmetry[rule] = {"exact_on_grid": exact, "between": over or None, "errors": rows}
     return {
         "elements_of": measured.name,
         "observations": len(observations.depth),
-        "batches": sorted(set(batch_sizes(len(observations.depth)))),
         "tolerance": tolerance,
         "symmetry": symmetry,
-        "exact": all(symmetry[PHYSICAL]["exact"].values()),
+        "exact_on_grid": all(symmetry[PHYSICAL]["exact_on_grid"].values()),
     }
+
+
+def _measured_elements(group: SymmetryGroup) -> list[Element]:
+    """All that map pixels onto pixels but the identity, and some of the others."""
+    grid = [g for g in group.grid_elements if g != Element(0.0)]
+    others = [g for g in group.some_elements(8) if not g.preserves_grid]
+    return grid + others[:: max(1, math.ceil(len(others) / _MOST_BETWEEN))]
+
+
+def _together(errors: list[dict[str, float]]) -> dict[str, float]:
+    """The errors by several elements as one: means, and the largest."""
+    over = {key: sum(error[key] for error in errors) / len(errors) for key in errors[0]}
+    return {**over, "largest": max(error["largest"] for error in errors)}
 
 
 def summary(certificate: dict[str, Any]) -> str:
@@ -167,43 +190,60 @@ def summary(certificate: dict[str, Any]) -> str:
         f"{about['method']} policy ({policy}) of {about['task']}, seed {about['seed']}, "
         f"{about['steps']} steps; equirl {about['equirl']}, torch {about['torch']}",
         f"image: {image['pixels']} x {image['pixels']} pixels, {image['side_m']:g} m a side",
-        f"measured on {about['observations']} observations, in batches of "
-        f"{', '.join(map(str, about['batches']))}; the numbers below are the largest errors",
+        f"measured on {about['observations']} observations",
     ]
+    if "batches" in about:
+        lines.append(f"compared in batches of {', '.join(map(str, about['batches']))}")
     for key, text in _LINES.items():
         if key in about:
-            lines.append(f"{text}: " + ", ".join(f"{n} {e:.1e}" for n, e in about[key].items()))
+            errors = ", ".join(f"{name} {error:.1e}" for name, error in about[key].items())
+            lines.append(f"{text}: {errors}")
     for rule, found in about["symmetry"].items():
-        rows = [
-            [row["element"], *(f"{row[name]:.1e}" for name in OUTPUTS), f"{row['unturned']:.1e}"]
-            for row in found["errors"]
-        ]
-        if rows:
-            columns = ["turn", *OUTPUTS, "action, left unturned"]
-            lines += ["", _RULES[rule], "", markdown_table(columns, rows).strip()]
-        lines += ["", _verdict(found["exact"], bool(rows), about["elements_of"])]
+        rows, group = [row for row in found["errors"] if row["on_grid"]], about["elements_of"]
+        if found["between"]:
+            number = len(found["errors"]) - len(rows)
+            rows.append({"element": f"{number} others of {group}", **found["between"]})
+        cells = [[row["element"], *(_cell(row[name]) for name in OUTPUTS)] for row in rows]
+        cells.append(["mean size", *(f"{rows[0][name]['size']:.1e}" for name in OUTPUTS)])
+        lines += ["", _RULES[rule], "", markdown_table(["turn", *OUTPUTS], cells).strip()]
+        lines += ["", _verdict(found, group)]
     return "\n".join(lines)
 
 
 _LINES = {
-    "rounding": "float32 instead of float64",
-    "difference": "this file instead of the policy of the run",
+    "rounding": "float32 instead of float64, at most",
+    "difference": "this file instead of the policy of the run, at most",
     "tolerance": "up to here an error counts as rounding",
 }
 _RULES = {
-    PHYSICAL: "Errors when the scene is turned, as the world turns:",
+    PHYSICAL: "Errors when the scene is turned, as the world turns; mean (largest):",
     PAPER: "Errors when the scene is turned, as the paper's networks declare it (theta and the "
-    "deviations are invariants):",
+    "deviations are invariants); mean (largest):",
 }
 
 
-def _verdict(exact: dict[str, bool], measured: bool, group: str) -> str:
-    if not measured:
-        return f"Nothing is certified: no turn of {group} maps pixels onto pixels."
+def _cell(error: dict[str, float]) -> str:
+    return f"{error['mean']:.1e} ({error['largest']:.1e})"
+
+
+def _verdict(found: dict[str, Any], group: str) -> str:
+    """What holds, in sentences."""
+    grid, between = any(row["on_grid"] for row in found["errors"]), found["between"]
     scope = f"the turns of {group} that map pixels onto pixels"
-    good = [name for name in OUTPUTS if exact[name]]
-    bad = [name for name in OUTPUTS if not exact[name]]
-    if not bad:
-        return f"Exact up to rounding under {scope}: {', '.join(good)}."
-    rest = f"; exact up to rounding: {', '.join(good)}" if good else ""
-    return f"Not exact under {scope}: {', '.join(bad)}{rest}."
+    good = ", ".join(name for name in OUTPUTS if found["exact_on_grid"][name])
+    bad = ", ".join(name for name in OUTPUTS if not found["exact_on_grid"][name])
+    if not grid:
+        verdict = f"Nothing is certified as exact: no turn of {group} maps pixels onto pixels."
+    elif not bad:
+        verdict = f"Exact up to rounding under {scope}: {good}."
+    else:
+        rest = f"; exact up to rounding: {good}" if good else ""
+        verdict = f"Not exact under {scope}: {bad}{rest}."
+    if between is None:
+        return verdict
+    where, error = "Between them" if grid else "At those it has", between["action"]
+    return (
+        f"{verdict} {where} the action, of a mean size of {error['size']:.1e}, errs by "
+        f"{error['mean']:.1e} in the mean and {error['largest']:.1e} at most; turning the picture "
+        f"there and back changes it by {error['there_and_back']:.1e} in the mean."
+    )

@@ -33,6 +33,7 @@ from equirl.training.export.measures import (
     Observations,
     allowed,
     answers,
+    batch_sizes,
     differences,
     make_observations,
     tolerances,
@@ -142,8 +143,8 @@ def check_exported(
         ExportError: The file is not an exported policy, is not what its certificate says, or does
             not do what the run's policy does.
     """
-    certificate, exported = read_certificate(path), load_exported(path)
-    image, stored = certificate["image"], None
+    about, exported = read_certificate(path), load_exported(path)
+    image, stored = about["image"], None
     if folder is not None:
         config, state, learner = load_learner(folder, "cpu", "auto")
         if config.env.image_size != image["pixels"]:
@@ -153,12 +154,12 @@ def check_exported(
             )
         stored = _stored(config, state, observations // 2)
     seen = make_observations(observations, image["pixels"], image["max_depth_m"], stored)
-    about = certificate
     again = measure(exported, seen, about["tolerance"], about["group"], about["mode"])
     for rule, found in again["symmetry"].items():
-        for name, exact in certificate["symmetry"][rule]["exact"].items():
-            if exact and not found["exact"][name]:
-                worst = max(float(row[name]) for row in found["errors"])
+        claimed = about["symmetry"].get(rule, {}).get("exact_on_grid", {})
+        for name in OUTPUTS:
+            if claimed.get(name) and not found["exact_on_grid"][name]:
+                worst = max(row[name]["largest"] for row in found["errors"] if row["on_grid"])
                 raise ExportError(
                     f"{path} is not what its certificate says: {name} is said to turn exactly "
                     f"({rule}) and errs by {worst:.1e}"
@@ -167,7 +168,7 @@ def check_exported(
     if folder is not None:
         original = _Original(learner.policy, seen)
         compared = original.compare(exported, f"{path} is not the policy of {folder}")
-    old = {key: about[key] for key in about if key not in ("rounding", "difference")}
+    old = {key: about[key] for key in about if key not in ("batches", "rounding", "difference")}
     return old | compared | again
 
 
@@ -201,7 +202,7 @@ class _Original:
         self._bounds = allowed(self._rounding, self._outputs)
         self.tolerance = tolerances(self._bounds, self._outputs)
 
-    def compare(self, exported: Policy, refusal: str) -> dict[str, dict[str, float]]:
+    def compare(self, exported: Policy, refusal: str) -> dict[str, Any]:
         """How far the dense filters are from float64, and the file from the actor.
 
         Raises:
@@ -216,7 +217,8 @@ class _Original:
                         f"{len(self._seen.depth)} observations), and rounding explains {most:.2g}"
                     )
         both = {"rounding": self._rounding, "difference": found}
-        return {key: {name: e.largest for name, e in each.items()} for key, each in both.items()}
+        largest = {key: {name: e.largest for name, e in x.items()} for key, x in both.items()}
+        return {"batches": sorted(set(batch_sizes(len(self._seen.depth)))), **largest}
 
 
 def _plain(actor: ProbabilisticActor, dtype: torch.dtype) -> Policy:

@@ -75,8 +75,8 @@ def trace(policy: FrozenPolicy, image_size: int) -> ExportedProgram:
     """The policy as a program for any number of images of shape (1, S, S)."""
     example = torch.rand(3, 1, image_size, image_size), torch.zeros(3, 1)
     batch = torch.export.Dim("batch", min=1)
-    shapes = {name: {0: batch} for name in INPUTS}
-    program = torch.export.export(policy, example, dynamic_shapes=shapes)
+    shapes = tuple({0: batch} for _ in INPUTS)
+    program = torch.export.export(policy, example, dynamic_shapes=(shapes,))
     for node in program.graph.nodes:  # they name folders of this machine
         node.meta.pop("stack_trace", None)
     return program
@@ -122,7 +122,30 @@ def read_certificate(path: str | Path) -> dict[str, Any]:
         certificate = json.loads(format.certificate(Path(path)))
         if not isinstance(certificate, dict) or certificate.get("format") != 1:
             raise ValueError("its certificate is not of format 1")
+        for where in _lacking(certificate, _NEEDED):
+            raise ValueError(f"its certificate lacks {where}")
         return certificate
+
+
+#: What `check_exported` and `summary` take from a certificate, measurements apart, and its kind.
+_NEEDED: dict[str, Any] = {
+    **dict.fromkeys(("equirl", "torch", "task", "method"), str),
+    **dict.fromkeys(("group", "mode"), str | None),
+    **dict.fromkeys(("seed", "steps"), int),
+    "image": {"pixels": int, "side_m": int | float, "max_depth_m": int | float},
+    "tolerance": dict.fromkeys(OUTPUTS, int | float),
+    "symmetry": {"physical": {"exact_on_grid": dict.fromkeys(OUTPUTS, bool)}},
+}
+
+
+def _lacking(values: dict[str, Any], needed: dict[str, Any]) -> Iterator[str]:
+    """The paths of what is missing or of another kind."""
+    for key, kind in needed.items():
+        value = values.get(key, ...)
+        if not isinstance(value, dict if isinstance(kind, dict) else kind):
+            yield key
+        elif isinstance(kind, dict):
+            yield from (f"{key}.{inner}" for inner in _lacking(value, kind))
 
 
 @contextlib.contextmanager

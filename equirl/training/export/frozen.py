@@ -21,8 +21,16 @@ class FrozenPolicy(nn.Module):
     actor is copied, not changed. It runs on the CPU.
 
     Args:
-        actor: Made by one of the methods of `equirl.modules.METHODS`.
+        actor: Made by `equirl.modules.make_actor`, of any keys and any action, or by one of the
+            methods of `equirl.modules.METHODS`.
         dtype: Of the parameters; filters are expanded in it.
+
+    Example:
+        >>> from equirl.modules import make_actor
+        >>> actor = make_actor("D4", hidden=8, image_size=16)
+        >>> action, loc, scale = FrozenPolicy(actor)(torch.rand(2, 1, 16, 16), torch.zeros(2, 1))
+        >>> action.shape
+        torch.Size([2, 5])
     """
 
     def __init__(self, actor: ProbabilisticActor, dtype: torch.dtype = torch.float32):
@@ -41,17 +49,17 @@ class FrozenPolicy(nn.Module):
             parameter.data = parameter.data.contiguous()
         self.requires_grad_(False).eval()
 
-    def forward(self, depth: Tensor, holding: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The greedy action, and the Gaussian it is the squashed mean of.
 
         Args:
-            depth: Shape (B, 1, S, S), m.
-            holding: Shape (B, 1), 0 or 1.
+            inputs: What the actor reads, in the order of its ``in_keys``: for a policy of
+                manipulation, depth (B, 1, S, S), m, and holding (B, 1), 0 or 1.
 
         Returns:
-            Action, mean and standard deviation, each (B, 5).
+            Action, mean and standard deviation, each (B, number of the action's components).
         """
-        loc, scale = self.network(depth, holding)
+        loc, scale = self.network(*inputs)
         return self._distribution(loc, scale, **self._options).deterministic_sample, loc, scale
 
 

@@ -1,20 +1,24 @@
 """How far two policies differ, and how far a policy is from turning with the scene.
 
-Everything is measured on arrays, with the arithmetic of `equirl.symmetry.audit_transforms`, which
-networks and replay buffers share nothing with.
+Two policies are compared on arrays; how a policy turns is measured by the equivariance report,
+whose arithmetic networks and replay buffers share nothing with.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import Tensor
 
-from equirl.symmetry import Element
-from equirl.symmetry.audit_transforms import transform_action, transform_image
-from equirl.training.export.formats import OUTPUTS, Outputs, Policy
+from equirl.symmetry import Element, SymmetryGroup, equivariance_report, random_observations
+from equirl.symmetry.audit_transforms import ACTION_FIELDS
+from equirl.training.export.formats import INPUTS, OUTPUTS, Outputs, Policy
 
 __all__ = [
     "PAPER",
@@ -27,6 +31,7 @@ __all__ = [
     "differences",
     "element_name",
     "make_observations",
+    "remembered",
     "tolerances",
     "turning_errors",
 ]
@@ -41,6 +46,14 @@ LARGEST_ROUNDING = 1e-3
 
 #: How actions and deviations turn: as in the world, or as the paper's networks declare it.
 PHYSICAL, PAPER = "physical", "paper"
+_THETA_KEPT = ("trivial", "vector", "trivial", "trivial")
+_LAWS: dict[str, dict[str, tuple[str, ...]]] = {
+    PHYSICAL: dict.fromkeys(OUTPUTS, ACTION_FIELDS),
+    PAPER: {"action": _THETA_KEPT, "loc": _THETA_KEPT, "scale": ("trivial",) * 5},
+}
+#: What the equivariance report calls the outputs, and its columns that certificates have.
+_QUANTITIES = {"action": "action", "loc": "mean", "scale": "sigma"}
+_COLUMNS = {"mean": "mean", "largest": "max", "size": "size", "there_and_back": "interpolated"}
 
 
 class Observations(NamedTuple):
@@ -58,11 +71,7 @@ class Observations(NamedTuple):
 def make_observations(
     count: int, image_size: int, max_depth: float, stored: Observations | None = None
 ) -> Observations:
-    """Observations to measure on: the stored ones, and images drawn at random.
-
-    Of those drawn a third is noise, in which each pixel is on its own; a third a floor with boxes
-    on it; and a third looks the same from every side, where a network that breaks ties by order
-    errs.
+    """Observations to measure on: the stored ones, and those of `random_observations`.
 
     Args:
         count: How many.
@@ -70,29 +79,11 @@ def make_observations(
         max_depth: The greatest depth, m.
         stored: Observations of the task, which come first.
     """
-    rng = np.random.default_rng(0)
-    drawn = [_draw(number % 3, image_size, rng) for number in range(count)]
-    depth = max_depth * np.array(drawn, np.float32)[:, None]
-    holding = rng.integers(0, 2, (count, 1)).astype(np.float32)
-    if stored is not None:
-        depth = np.concatenate([stored.depth, depth])[:count]
-        holding = np.concatenate([stored.holding, holding])[:count]
-    return Observations(depth, holding)
-
-
-def _draw(kind: int, size: int, rng: np.random.Generator) -> np.ndarray:
-    """Draws an image (size, size) of numbers in [0, 1]."""
-    if kind == 0:
-        return rng.uniform(size=(size, size))
-    image = np.full((size, size), rng.uniform(0.3, 1))
-    if kind == 1:
-        for _ in range(3):
-            row, column = rng.integers(0, size - size // 4, 2)
-            image[row : row + size // 4, column : column + size // 4] = rng.uniform()
-    else:
-        border = rng.integers(0, size // 2)
-        image[border : size - border, border : size - border] = rng.uniform()
-    return image
+    drawn = random_observations(count, image_size, max_depth=max_depth)
+    seen = Observations(drawn["depth"].numpy(), drawn["holding"].numpy())
+    if stored is None:
+        return seen
+    return Observations(*(np.concatenate(both)[:count] for both in zip(stored, seen, strict=True)))
 
 
 def batch_sizes(count: int) -> list[int]:
@@ -159,50 +150,70 @@ def tolerances(bounds: dict[str, Difference], outputs: Outputs) -> dict[str, flo
 def turning_errors(
     policy: Policy,
     observations: Observations,
-    before: Outputs,
+    group: SymmetryGroup,
     elements: Sequence[Element],
-    rules: Sequence[str] = (PHYSICAL,),
-) -> dict[str, list[dict[str, float | str]]]:
+    rule: str = PHYSICAL,
+) -> list[dict[str, Any]]:
     """How far the answers to turned observations are from the turned answers.
 
     Args:
         policy: What is measured.
-        observations: To be turned.
-        before: Its answers to them as they are.
-        elements: Turns that map pixels onto pixels.
-        rules: `PHYSICAL`, `PAPER` or both.
+        observations: To be turned; by interpolation where pixels do not fall onto pixels.
+        group: Whose elements are taken.
+        elements: By which to turn, at least one.
+        rule: `PHYSICAL` or `PAPER`.
 
     Returns:
-        For each rule a row an element: its name, the largest absolute error of each output, and
-        ``unturned``, the error of the action that the answer left as it was would have.
+        A row an element: its name, ``degrees``, whether it is ``reflected`` and ``on_grid``, and
+        for each output the ``mean`` and the ``largest`` absolute error, the mean ``size`` of what
+        was to be turned, and ``there_and_back``, the mean change when the picture is turned there
+        and back, None where that is exact.
     """
-    rows: dict[str, list[dict[str, float | str]]] = {rule: [] for rule in rules}
-    for element in elements:
-        turned = np.ascontiguousarray(transform_image(observations.depth, element))
-        after = answers(policy, Observations(turned, observations.holding))
-        for rule in rules:
-            expected = _turn(before, element, rule)
-            errors = differences(after, expected)
-            rows[rule].append(
-                {
-                    "element": element_name(element),
-                    **{name: error.largest for name, error in errors.items()},
-                    "unturned": differences(before, expected)["action"].largest,
-                }
-            )
+    seen = {name: torch.from_numpy(array) for name, array in observations._asdict().items()}
+    inputs = TensorDict(seen, batch_size=[len(observations.depth)])
+    rows: list[dict[str, Any]] = [
+        {
+            "element": element_name(element),
+            "degrees": math.degrees(element.angle),
+            "reflected": element.reflected,
+            "on_grid": element.preserves_grid,
+        }
+        for element in elements
+    ]
+    laws = _LAWS[rule]
+    for fields in dict.fromkeys(laws.values()):
+        names = [name for name in OUTPUTS if laws[name] == fields]
+        report = equivariance_report(
+            _as_module(policy, names), group, inputs, elements=elements, action=fields, layers=False
+        )
+        for name in names:
+            found = report.select(name=_QUANTITIES[name])
+            for number, row in enumerate(rows):
+                row[name] = {key: float(found[c][number]) for key, c in _COLUMNS.items()}
+                if row["on_grid"]:
+                    row[name]["there_and_back"] = None
     return rows
 
 
-def _turn(outputs: Outputs, element: Element, rule: str) -> Outputs:
-    keep_theta = rule == PAPER
-    moved = {
-        name: np.stack([transform_action(row, element, keep_theta) for row in outputs[name]])
-        for name in ("action", "loc")
-    }
-    scale = outputs["scale"].copy()
-    if rule == PHYSICAL and (element.quarter_turns or 0) % 2:  # the axes of x and y change places
-        scale[:, [1, 2]] = scale[:, [2, 1]]
-    return {**moved, "scale": scale}
+def remembered(policy: Policy) -> Policy:
+    """The same policy, asked only once about the same observations."""
+    known: dict[int, Outputs] = {}
+
+    def function(depth: np.ndarray, holding: np.ndarray) -> Outputs:
+        key = hash((depth.tobytes(), holding.tobytes()))
+        if key not in known:
+            known[key] = policy(depth, holding)
+        return known[key]
+
+    return function
+
+
+def _as_module(policy: Policy, names: Sequence[str]) -> TensorDictModule:
+    def function(depth: Tensor, holding: Tensor) -> tuple[Tensor, ...]:
+        out = policy(depth.numpy(), holding.numpy())
+        return tuple(torch.from_numpy(out[name]) for name in names)
+
+    return TensorDictModule(function, in_keys=list(INPUTS), out_keys=list(names))
 
 
 def element_name(element: Element) -> str:
@@ -210,4 +221,4 @@ def element_name(element: Element) -> str:
     turn = f"{math.degrees(element.angle):g}°"
     if not element.reflected:
         return turn
-    return f"y reversed, {turn}" if element.quarter_turns else "y reversed"
+    return "y reversed" if element.angle == 0 else f"y reversed, {turn}"
