@@ -51,21 +51,25 @@ def plot_runs(groups: Mapping[str, Sequence[Path]], path: Path, *, title: str = 
         title: Above the figure.
     """
     plt = pyplot()
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
     for colour, (label, folders) in zip(cycle(COLOURS), groups.items(), strict=False):
-        _draw_success(left, folders, label, colour)
+        _draw_success(left, folders, label, colour, interval=len(groups) <= 3)
         _draw_return(right, folders, label, colour)
-    if left.get_legend_handles_labels()[0]:  # none without validations
-        left.legend(frameon=False)
+    handles, labels = left.get_legend_handles_labels()
+    if labels:  # none without validations
+        columns = min(len(labels), 7)
+        figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
     figure.suptitle(title)
     save(figure, path)
 
 
-def _draw_success(axes: Axes, folders: Sequence[Path], label: str, colour: str) -> None:
+def _draw_success(
+    axes: Axes, folders: Sequence[Path], label: str, colour: str, interval: bool = True
+) -> None:
     tables = [table for folder in folders if (table := read_table(folder / "validation.csv"))]
     for table in tables:
         axes.plot(table["step"], table["success_rate"], color=colour, lw=1, alpha=0.4)
-        if len(tables) == 1:
+        if len(tables) == 1 and interval:  # many would hide one another
             axes.fill_between(table["step"], table["low"], table["high"], color=colour, alpha=0.15)
     if tables:
         steps = sorted(set.intersection(*(set(table["step"]) for table in tables)))

@@ -10,7 +10,10 @@ if TYPE_CHECKING:
 
 __all__ = ["COLOURS", "pyplot", "save"]
 
-COLOURS = ("#0b6e99", "#d9730d", "#448361", "#9065b0", "#c14c8a")
+COLOURS = (
+    *("#0b6e99", "#d9730d", "#448361", "#9065b0", "#c14c8a"),
+    *("#b3261e", "#5b6770", "#8a6d1f"),
+)
 
 
 def pyplot() -> Any:
