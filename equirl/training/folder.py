@@ -41,7 +41,7 @@ FILES = {
     METRICS: "a row a training episode",
     "validation.csv": "success of the greedy policy on the validation scenes, while training",
     TEST: "a row a test scene, after training",
-    "symmetry.csv": "errors of policy and critic under the group, while training",
+    "symmetry.csv": "errors under the group, on the pixel grid and between, while training",
     "timing.csv": "minutes so far, and milliseconds a call of each part of a step",
     CHECKPOINT: "networks, optimiser, replay buffer: all a resume needs",
     CURVES: "learning curves",
