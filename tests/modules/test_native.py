@@ -18,6 +18,7 @@ from equirl.modules import (
     SteerableConv,
     shared_filters,
 )
+from equirl.modules.native import calls as kernels
 from equirl.modules.native import layer as native
 from equirl.modules.native import library
 from equirl.modules.native.spectral import spectral_basis
@@ -43,10 +44,10 @@ def instruction_set(request, monkeypatch):
     if names.index(request.param) > names.index(library.best_instruction_set()):
         pytest.skip(f"this processor has no {request.param}")
     handle = library._open(library.library_path(request.param))
-    monkeypatch.setattr(native, "load", lambda: library.Library(request.param, handle))
-    native._functions.cache_clear()
+    monkeypatch.setattr(kernels, "load", lambda: library.Library(request.param, handle))
+    kernels._functions.cache_clear()
     yield request.param
-    native._functions.cache_clear()
+    kernels._functions.cache_clear()
 
 
 def make_layer(group, fields_in, fields_out, padding, kind="regular", seed=0):
@@ -59,7 +60,7 @@ def make_layer(group, fields_in, fields_out, padding, kind="regular", seed=0):
     return conv
 
 
-def through_kernels(conv, x, pool=False, relu=False, block=native.BLOCK):
+def through_kernels(conv, x, pool=False, relu=False, block=kernels.BLOCK):
     """The layer on images in the usual layout and order of channels."""
     channels = 1
     if conv.in_type.is_regular:
@@ -357,10 +358,10 @@ def test_spectral_weights_are_shared_like_filters(calls):
         assert_close(a, b)
 
 
-@pytest.mark.parametrize("block", [1, native.BLOCK])
+@pytest.mark.parametrize("block", [1, kernels.BLOCK])
 @pytest.mark.parametrize("pool", [False, True])
 def test_not_a_number_is_passed_on(instruction_set, pool, block):
-    conv = make_layer("D4", 2, 2, 1).requires_grad_(block == native.BLOCK)
+    conv = make_layer("D4", 2, 2, 1).requires_grad_(block == kernels.BLOCK)
     x = torch.randn(4, 16, 8, 8)
     x[1, 3, 2, 2] = float("nan")
     y = through_kernels(conv, x, pool, relu=True, block=block)
@@ -433,8 +434,8 @@ def test_a_network_without_its_library_says_so(monkeypatch):
     def missing():
         raise NativeUnavailable("not built")
 
-    monkeypatch.setattr(native, "load", missing)
-    native._functions.cache_clear()
+    monkeypatch.setattr(kernels, "load", missing)
+    kernels._functions.cache_clear()
     with pytest.raises(NativeUnavailable, match="not built"):
         encoder(*observation)
 

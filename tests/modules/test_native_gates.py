@@ -7,6 +7,7 @@ import torch
 
 from equirl.modules import FieldType, GatedNonlinearity, NormMaxPool, SteerableConv
 from equirl.modules.native import layer as native
+from equirl.modules.native.calls import BLOCK
 from equirl.modules.native.spectral import spectral_basis
 from equirl.symmetry import SymmetryGroup
 from tests.modules.test_native import assert_close, instruction_set  # noqa: F401 (a fixture)
@@ -37,7 +38,7 @@ def make_layer(group, hidden, fields_in, fields_out, padding):
     return conv, gates
 
 
-def through_kernels(conv, gates, x, ties=None, block=native.BLOCK):
+def through_kernels(conv, gates, x, ties=None, block=BLOCK):
     """The layer on images in the usual layout."""
     hidden = conv.in_type.fields[-1] != "trivial"
     channels = FieldType.hidden(conv.in_type.group, 1).size if hidden else 1
@@ -121,7 +122,7 @@ def test_large_and_small_numbers(instruction_set, size):  # noqa: F811
     assert_close(through_kernels(conv, gates, x, "shared"), expected)
 
 
-@pytest.mark.parametrize("block", [1, native.BLOCK])
+@pytest.mark.parametrize("block", [1, BLOCK])
 @pytest.mark.parametrize("ties", [None, "shared", "first"])
 def test_not_a_number_is_passed_on(instruction_set, ties, block):  # noqa: F811
     conv, gates = make_layer("SO2", True, 2, 2, 1)
@@ -146,7 +147,7 @@ def test_spectral_weights_are_as_many_as_the_steerable_ones(group, kind):
 def test_what_is_not_served_is_refused():
     group = SymmetryGroup("O2")
     conv, gates = make_layer("O2", True, 2, 2, 1)
-    x = torch.randn(1, 2, 8, 8, 8, native.BLOCK)
+    x = torch.randn(1, 2, 8, 8, 8, BLOCK)
     native.gated_block(conv, gates, x)
     with pytest.raises(ValueError, match="ReLU commutes with regular fields"):
         plain = SteerableConv(FieldType.hidden(group, 2), FieldType.hidden(group, 2), padding=1)
