@@ -1,6 +1,7 @@
 """The configuration of a run: typed, validated, and the same with or without Hydra."""
 
 from equirl.config.declare import ConfigError, flatten
+from equirl.config.jobs import EvaluateJob, ExportJob, ReportJob, TrainJob, WatchJob
 from equirl.config.reading import (
     explain,
     load_config,
@@ -9,15 +10,7 @@ from equirl.config.reading import (
     to_config,
     write_atomically,
 )
-from equirl.config.schema import (
-    Config,
-    EvaluateJob,
-    ExportJob,
-    ReportJob,
-    TrainJob,
-    WatchJob,
-    is_free,
-)
+from equirl.config.schema import Config, is_free
 
 __all__ = [
     "Config",

@@ -18,7 +18,8 @@ from omegaconf.errors import (
 from yaml import YAMLError
 
 from equirl.config.declare import ConfigError, check_values, flatten
-from equirl.config.schema import Config, EvaluateJob, ExportJob, ReportJob, TrainJob, WatchJob
+from equirl.config.jobs import EvaluateJob, ExportJob, ReportJob, TrainJob, WatchJob
+from equirl.config.schema import Config
 
 __all__ = [
     "explain",

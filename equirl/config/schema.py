@@ -14,26 +14,23 @@ if TYPE_CHECKING:
     from equirl.envs.tasks import Task
 
 __all__ = [
+    "BACKENDS_SOURCE",
     "AlgorithmConfig",
     "AugmentationConfig",
     "Config",
     "DemosConfig",
     "EnvConfig",
-    "EvaluateJob",
     "EvaluationConfig",
-    "ExportJob",
     "LoggingConfig",
     "MethodConfig",
     "ReplayConfig",
-    "ReportJob",
-    "TrainJob",
-    "WatchJob",
     "is_free",
+    "make_run_task",
 ]
 
 # Where the rooms list what there is to choose from.
 _MODES = "equirl.symmetry.spec:MODES"
-_BACKENDS = "equirl.modules.backend:BACKENDS"
+BACKENDS_SOURCE = "equirl.modules.backend:BACKENDS"
 _METHODS = "equirl.modules.methods:METHODS"
 _ROBOTS = "equirl.envs:ROBOTS"
 
@@ -138,7 +135,7 @@ class Config:
     seed: int = at_least(0, 0)  # of networks, scenes, actions and replay
     device: str = field(default="auto", metadata={"free": True})  # "auto", "cpu" or "cuda:<i>"
     threads: int = at_least(0, 0, free=True)  # CPU threads of torch; 0: all cores
-    backend: str = one_of("auto", source=_BACKENDS, free=True)  # of equivariant encoders
+    backend: str = one_of("auto", source=BACKENDS_SOURCE, free=True)  # of equivariant encoders
 
     @property
     def torch_device(self) -> str:
@@ -191,108 +188,12 @@ class Config:
         return replace(self, group=group)
 
 
-@dataclass
-class TrainJob(Config):
-    """What the command line of ``experiments/train.py`` takes: a run and its folder."""
+def make_run_task(env: EnvConfig) -> Task:
+    """The task of an environment's keys.
 
-    output: str = ""  # the run's folder; a new one under outputs/ when empty
-    resume: str = ""  # folder of an interrupted run to go on with
-
-
-@dataclass
-class EvaluateJob:
-    """What the command line of ``experiments/evaluate.py`` takes."""
-
-    run: str = MISSING  # the folder of a run
-    episodes: int = at_least(100, 1)
-    first: int = at_least(0, 0)  # number of the first test scene
-    device: str = "auto"
-    backend: str = one_of("auto", source=_BACKENDS)
-    video: str = ""  # MP4 file to film the first episodes into
-    video_episodes: int = at_least(3, 1)
-
-
-@dataclass
-class ExportJob:
-    """What the command line of ``experiments/export.py`` takes."""
-
-    run: str = ""  # the folder of the run whose policy is exported
-    format: str = one_of("torch_export", "onnx")
-    output: str = ""  # a .pt2 or .onnx file; in the run's folder when empty
-    observations: int = at_least(64, 1)  # to measure on, half of them from the run's replay buffer
-    check: str = ""  # an exported file to measure again, and to compare with ``run`` if given
-
-    def validated(self) -> ExportJob:
-        """This job, if it says what to do.
-
-        Raises:
-            ConfigError: It does not.
-        """
-        if not self.run and not self.check:
-            raise ConfigError("run= is missing: expected the folder of a run, or check=FILE")
-        if self.check and self.output:
-            raise ConfigError(f"output={self.output}: leave it out, check={self.check} writes none")
-        return self
-
-
-@dataclass
-class ReportJob:
-    """What the command line of ``experiments/report.py`` takes."""
-
-    run: str = MISSING  # the folder of a run
-    group: str = ""  # whose elements are measured beside all angles; the run's own when empty
-    observations: int = at_least(16, 1)  # random ones, and as many from the run's replay buffer
-    angles: int = at_least(48, 1)  # turns measured, evenly spaced, beside those of the group
-    layers: bool = True  # measure each layer, too
-    keep_theta: bool = False  # take theta for an invariant of reflections, as mode=paper does
-    seed: int = at_least(0, 0)  # of the random observations and of the actions
-    device: str = "auto"
-    backend: str = one_of("auto", source=_BACKENDS)
-    output: str = ""  # the folder of page, table and picture; the run's own when empty
-
-    def validated(self) -> ReportJob:
-        """This job, if its group exists.
-
-        Raises:
-            ConfigError: It does not.
-        """
-        from equirl.symmetry import SymmetryGroup
-
-        if self.group:
-            try:
-                SymmetryGroup(self.group)
-            except ValueError as error:
-                raise ConfigError(f"group={self.group}: {error}") from None
-        return self
-
-
-@dataclass
-class WatchJob:
-    """What the command line of ``experiments/watch.py`` takes."""
-
-    env: EnvConfig = keys_of(EnvConfig)
-    policy: str = "expert"  # or "random", or the folder of a run, whose environment is then used
-    episodes: int = at_least(3, 1)
-    sheet_episodes: int = at_least(3, 1)  # the first ones, shown on the contact sheet
-    seed: int = at_least(0, 0)
-    output: str = ""  # a folder for film and sheet; outputs/watch/<task>/<policy> when empty
-    fps: int = at_least(4, 1)  # steps a second
-    # Pixels a side of each of the film's two pictures; video formats want an even number.
-    size: int = checked(384, lambda x: 2 <= x <= 4096 and x % 2 == 0, "an even number, 2 to 4096")
-
-    def validated(self) -> WatchJob:
-        """This job, if its task exists and has what is to be watched.
-
-        Raises:
-            ConfigError: It has not.
-        """
-        task = _make_task(self.env)
-        if self.policy == "expert" and task.expert is None:
-            raise ConfigError(f"policy=expert: {self.env.task} has no expert; there is random")
-        return self
-
-
-def _make_task(env: EnvConfig) -> Task:
+    Raises:
+        ConfigError: There is no such task, or it refuses its options.
+    """
     from equirl.envs.tasks import find_task, make_task
 
     if env.image_size % 2:
@@ -308,7 +209,7 @@ def _make_task(env: EnvConfig) -> Task:
 
 
 def _check_expert(env: EnvConfig, demos: DemosConfig) -> None:
-    task = _make_task(env)
+    task = make_run_task(env)
     if not demos.episodes:
         return
     if task.expert is None:
