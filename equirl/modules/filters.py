@@ -31,7 +31,7 @@ _active: ContextVar[_Cache | None] = ContextVar("equirl_shared_filters", default
 
 
 @contextlib.contextmanager
-def shared_filters() -> Iterator[None]:
+def shared_filters(*, apart: bool = False) -> Iterator[None]:
     """Within it, a filter is expanded once per weight tensor and then reused.
 
     A stored filter serves every pass through the same module with the same memory,
@@ -42,11 +42,14 @@ def shared_filters() -> Iterator[None]:
     The filters are dropped at the end of the context; an inner context shares the
     outer one's. Nothing is shared between threads, nor under ``vmap`` or ``export``.
 
+    Args:
+        apart: Share nothing with an outer context: for losses with a backward pass of their own.
+
     Example:
         >>> with shared_filters():
         ...     losses = loss_module(batch)
     """
-    if _active.get() is not None:
+    if _active.get() is not None and not apart:
         yield
         return
     token = _active.set({})

@@ -12,12 +12,14 @@ from torch import Tensor, nn
 
 __all__ = [
     "IMAGE_SIZES",
+    "CenterCropped",
     "Layer",
     "check_sizes",
     "convolve",
     "pyramid",
     "skeleton",
     "stack_observation",
+    "uncropped",
 ]
 
 #: The image sizes the encoders are defined for.
@@ -42,6 +44,16 @@ def check_sizes(hidden: int, image_size: int) -> None:
             f"hidden={hidden!r} is not supported at image_size={image_size}: expected a positive "
             f"multiple of {divisor}, for example {divisor}, {2 * divisor} or 64 (the paper's)"
         )
+
+
+def uncropped(image_size: int) -> int:
+    """Side of the observation of which the crop methods take a crop of ``image_size`` pixels.
+
+    142 for 128 (appendix D), in proportion for other sizes, and rounded up to an even number,
+    so that the margins of the crop at the centre are whole pixels: 18 for 16, 36 for 32, 72 for
+    64, 284 for 256.
+    """
+    return 2 * math.ceil(image_size * 142 / 256)
 
 
 def pyramid(image_size: int) -> list[float]:
@@ -121,3 +133,41 @@ def stack_observation(
         return image.contiguous().movedim(-1, 1)
     tiled = invariants.to(image.dtype).reshape(-1, 1, 1, count)
     return torch.cat([image, tiled.expand(*image.shape[:-1], count)], -1).movedim(-1, 1)
+
+
+class CenterCropped(nn.Module):
+    """An encoder that sees the centre of an image that is larger than its own.
+
+    The crop methods learn from crops and act on what the camera gives: this accepts either.
+    The pixel grid's rotations and reflections commute with it.
+
+    Args:
+        encoder: Maps an image (*batch, channels, S, S), and what else it is given, to features.
+        image_size: That S; images may have this side, or that of `uncropped`.
+    """
+
+    def __init__(self, encoder: nn.Module, image_size: int):
+        super().__init__()
+        self.encoder = encoder
+        self.image_size, self.uncropped_size = image_size, uncropped(image_size)
+
+    def forward(self, image: Tensor, *others: Tensor | None) -> Tensor:
+        """Encodes the centre of an image of shape (*batch, channels, size, size).
+
+        Raises:
+            ValueError: The size is neither that of the encoder nor the uncropped one.
+        """
+        seen, full = self.image_size, self.uncropped_size
+        if image.shape[-2:] == (full, full):
+            margin = (full - seen) // 2
+            image = image[..., margin : margin + seen, margin : margin + seen]
+        elif image.shape[-2:] != (seen, seen):
+            raise ValueError(
+                f"expected an image of {full} x {full} pixels, of which the centre is seen, or one "
+                f"cropped to {seen} x {seen}, got the shape {tuple(image.shape)}"
+            )
+        return self.encoder(image, *others)
+
+    def extra_repr(self) -> str:
+        """The sides of the images before and after the crop."""
+        return f"{self.uncropped_size} -> {self.image_size} px"

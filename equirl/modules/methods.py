@@ -1,4 +1,4 @@
-"""The methods, by name: what each builds its actor and critic with."""
+"""The methods, by name: what each builds its networks with, and what it asks of training."""
 
 from __future__ import annotations
 
@@ -11,26 +11,41 @@ from torchrl.modules import ProbabilisticActor
 from equirl.modules.actor import make_actor
 from equirl.modules.cnn import make_cnn_actor, make_cnn_critic
 from equirl.modules.critic import make_critic
+from equirl.modules.ferm import make_ferm_actor, make_ferm_critic
+from equirl.modules.rad import make_rad_actor, make_rad_critic
 
 __all__ = ["METHODS", "Method"]
 
 
 class Method(NamedTuple):
-    """The networks of a method.
+    """The networks of a method, and what its training adds to soft actor-critic.
 
     Attributes:
         make_actor: Takes ``hidden``, ``image_size``, ``device`` and ``generator``.
-        make_critic: The same.
+        make_critic: The same, and ``heads``.
         equivariant: Whether both take ``group``, ``mode`` and ``backend`` too, and the critic
             ``head_width``.
+        shifts: Whether the losses are averages over shifted copies of the observations.
+        crops: Whether the networks see less than the camera, whose images have the side
+            `uncropped` of ``image_size``: random crops in training, the centre when acting.
+        contrastive: Whether the critic's encoder is also trained to tell crops apart, first on
+            the demonstrations alone, and the actor's convolutions are tied to the critic's.
     """
 
     make_actor: Callable[..., ProbabilisticActor]
     make_critic: Callable[..., TensorDictSequential]
     equivariant: bool
+    shifts: bool = False
+    crops: bool = False
+    contrastive: bool = False
 
 
 METHODS = {
     "equivariant": Method(make_actor, make_critic, equivariant=True),
     "cnn": Method(make_cnn_actor, make_cnn_critic, equivariant=False),
+    "drq": Method(make_cnn_actor, make_cnn_critic, equivariant=False, shifts=True),
+    "rad": Method(make_rad_actor, make_rad_critic, equivariant=False, crops=True),
+    "ferm": Method(
+        make_ferm_actor, make_ferm_critic, equivariant=False, crops=True, contrastive=True
+    ),
 }

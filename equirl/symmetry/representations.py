@@ -18,6 +18,19 @@ from equirl.symmetry.groups import Element
 
 __all__ = ["Irrep", "Representation", "ScalarField"]
 
+_COSINES, _SINES = (1, 0, -1, 0), (0, 1, 0, -1)  #: of 0 to 3 quarter turns
+
+
+def _quarters(turns: Tensor) -> Tensor:
+    """Whole numbers of quarter turns as 0, 1, 2 or 3.
+
+    Raises:
+        ValueError: They are not integers.
+    """
+    if turns.dtype.is_floating_point or turns.dtype is torch.bool:
+        raise ValueError(f"expected integers, numbers of quarter turns, got {turns.dtype}")
+    return turns.long() % 4
+
 
 class Irrep(Enum):
     """The irreducible representations of O(2) that physical quantities here use."""
@@ -68,6 +81,20 @@ class Representation:
     def rotate(self, x: Tensor, angles: Tensor) -> Tensor:
         """Rotates ``x`` of shape (B, dim) by ``angles`` of shape (B,), in rad."""
         return self._apply(x, angles.cos().to(x), angles.sin().to(x), reflected=False)
+
+    def quarter_turns(self, x: Tensor, turns: Tensor) -> Tensor:
+        """Rotates ``x`` of shape (B, dim) by ``turns`` quarter turns, without rounding.
+
+        Args:
+            x: Shape (B, dim).
+            turns: Shape (B,), integers of either sign.
+
+        Raises:
+            ValueError: The turns are not integers.
+        """
+        turns = _quarters(turns)
+        cos, sin = (x.new_tensor(values)[turns] for values in (_COSINES, _SINES))
+        return self._apply(x, cos, sin, reflected=False)
 
     def _apply(self, x: Tensor, cos: Tensor, sin: Tensor, reflected: bool) -> Tensor:
         if x.shape[-1] != self.dim:
@@ -122,12 +149,36 @@ class ScalarField:
         Raises:
             ValueError: The images are not square.
         """
-        size = image.shape[-1]
-        if image.shape[-2] != size:
-            raise ValueError(f"expected square images (B, C, S, S), got {tuple(image.shape)}")
+        size = self._size(image)
         centres = (2 * torch.arange(size, device=image.device) + 1 - size).to(image) / size
         row, column = centres[:, None], centres
         cos, sin = (part.to(image)[:, None, None] for part in (angles.cos(), angles.sin()))
         # The inverse rotation: each output pixel asks for the input point it came from.
         grid = torch.stack([cos * column - sin * row, sin * column + cos * row], -1)
         return F.grid_sample(image, grid, padding_mode="border", align_corners=False)
+
+    def quarter_turns(self, image: Tensor, turns: Tensor) -> Tensor:
+        """Rotates each image by its own number of quarter turns: a permutation of its pixels.
+
+        Args:
+            image: Shape (B, C, S, S), of any dtype.
+            turns: Shape (B,), integers of either sign.
+
+        Raises:
+            ValueError: The images are not square, or the turns are not integers.
+        """
+        self._size(image)
+        turns = _quarters(turns)
+        out = image.clone()
+        for quarters in (1, 2, 3):
+            chosen = turns == quarters
+            out[chosen] = image[chosen].rot90(quarters, (-2, -1))
+        return out
+
+    @staticmethod
+    def _size(image: Tensor) -> int:
+        """Number of rows and columns S of square images."""
+        rows, columns = image.shape[-2:]
+        if rows != columns:
+            raise ValueError(f"expected square images (B, C, S, S), got {tuple(image.shape)}")
+        return columns

@@ -103,6 +103,27 @@ class SymmetrySpec:
                 out.set(key, part)
         return out
 
+    def quarter_turns(self, tensordict: TensorDictBase, turns: Tensor) -> TensorDictBase:
+        """Rotates each row of a tensordict of batch size (B,) by its own number of quarter turns.
+
+        Exact: pixels are permuted and vectors swap components, as `transform` does for one
+        element; `rotate` by ``turns * pi / 2`` is the same up to rounding.
+
+        Args:
+            tensordict: Images of shape (B, C, S, S), vectors of shape (B, dim).
+            turns: Shape (B,), integers of either sign.
+
+        Returns:
+            A new tensordict; undeclared keys are shared with the input.
+
+        Raises:
+            ValueError: The turns are not integers, or images are not square.
+        """
+        out = tensordict.clone(recurse=False)
+        for key, rule, value in self._present(tensordict):
+            out.set(key, rule.quarter_turns(value, turns))
+        return out
+
     def _present(
         self, tensordict: TensorDictBase
     ) -> list[tuple[NestedKey, Representation | ScalarField, Tensor]]:

@@ -156,3 +156,55 @@ def test_images_that_are_not_square_are_refused_and_every_float_dtype_turns():
     turned = field.rotate(image.bfloat16(), angles)
     assert turned.dtype == torch.bfloat16
     torch.testing.assert_close(turned.float(), field.rotate(image, angles), atol=0.05, rtol=0)
+
+
+TURNS = torch.tensor([0, 1, 2, 3, -1, 6, 1])
+
+
+def rows_to_turn(dtype=torch.float32, size=6):
+    from tensordict import TensorDict
+
+    rows = len(TURNS)
+    generator = torch.Generator().manual_seed(2)
+
+    def normal(*shape):
+        return torch.randn(rows, *shape, generator=generator, dtype=dtype)
+
+    data = {"depth": normal(1, size, size), "action": normal(5), "holding": normal(1)}
+    return TensorDict({**data, "next": {"depth": normal(1, size, size)}}, rows)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_quarter_turns_are_those_of_the_group_bit_for_bit(dtype):
+    data = rows_to_turn(dtype)
+    turned = manipulation_spec().quarter_turns(data, TURNS)
+    for before, after, turns in zip(data, turned, TURNS.tolist(), strict=True):
+        expected = manipulation_spec().transform(before, Element(turns * math.pi / 2))
+        x, y = before["action"][1:3]
+        by_hand = ((x, y), (-y, x), (-x, -y), (y, -x))[turns % 4]
+        assert torch.equal(after["action"][1:3], torch.stack(by_hand))
+        assert torch.equal(after["action"], expected["action"])
+        for key in ("depth", ("next", "depth")):
+            assert torch.equal(after[key], before[key].rot90(turns, (1, 2)))
+            assert torch.equal(after[key], expected[key])
+        assert torch.equal(after["holding"], before["holding"])
+
+
+@pytest.mark.parametrize("size", [7, 16, 18])
+def test_quarter_turns_are_rotations_by_their_angles_up_to_rounding(size):
+    data, spec = rows_to_turn(torch.float64, size), manipulation_spec()
+    rotated = spec.rotate(data, TURNS.double() * math.pi / 2)
+    turned = spec.quarter_turns(data, TURNS)
+    for key in ("depth", ("next", "depth"), "action"):
+        torch.testing.assert_close(turned[key], rotated[key], atol=1e-9, rtol=0)
+
+
+def test_quarter_turns_of_bytes_and_what_they_refuse():
+    image = torch.randint(256, (2, 3, 4, 4), dtype=torch.uint8)
+    turned = ScalarField().quarter_turns(image, torch.tensor([1, 0], dtype=torch.int8))
+    assert torch.equal(turned, torch.stack([image[0].rot90(1, (1, 2)), image[1]]))
+    with pytest.raises(ValueError, match=r"square images .* got \(2, 1, 6, 8\)"):
+        ScalarField().quarter_turns(torch.rand(2, 1, 6, 8), torch.tensor([0, 2]))
+    for rule, value in ((ScalarField(), image), (ACTION, torch.zeros(2, 5))):
+        with pytest.raises(ValueError, match=r"integers, .* got torch.float32"):
+            rule.quarter_turns(value, torch.tensor([0.5, 1.0]))
