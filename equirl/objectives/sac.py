@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictSequential
 from torch import Tensor
@@ -35,6 +36,12 @@ class SACLoss(TorchRLSACLoss):
       reparameterised and Q_i held fixed;
     * ``loss_alpha``  = -mean (log alpha (log pi(b|s) + H)), the last factor held fixed.
 
+    Transitions of a prioritized replay carry importance weights w, which make up for their being
+    drawn more often than others (Schaul et al. 2016): then ``loss_qvalue`` is
+    sum_i mean w (Q_i(s, a) - y)^2. Beyond the paper, a critic of more than two heads is an
+    ensemble as in REDQ (Chen et al. 2021): each target takes the smaller of two heads drawn at
+    random for the batch, and the actor climbs the mean of all.
+
     Args:
         actor: Stochastic policy, in_keys those of the observation.
         critic: A sequence of two modules: the encoder, observation to features, and the
@@ -42,12 +49,16 @@ class SACLoss(TorchRLSACLoss):
         alpha_init: Initial entropy temperature.
         target_entropy: Entropy that the temperature is tuned to, in nats.
         gamma: Discount factor.
+        importance_weights: Whether ``priority_weight`` (B,), where a batch has it, weights the
+            critic's loss; the paper's system computes weights and drops them.
+        generator: Source of the losses' own randomness; torch's global one if None. Actions
+            are drawn from the global one always, as in torch.distributions.
 
     Forward:
         Takes a tensordict of batch size (B,) and returns one of scalars ``loss_actor``,
         ``loss_qvalue`` (the sum over heads of the mean squared errors), ``loss_alpha``,
         ``alpha`` and ``entropy``; writes ``td_error`` (B,), the mean of the heads'
-        absolute errors, into its input. The sum of the three losses can be
+        absolute errors, into its input. The sum of the losses can be
         differentiated at once: each reaches its own parameters only. `backward`
         does so with less memory. Unlike TorchRL's losses it takes no loose tensors by name:
         the batch size cannot be told from images of one channel.
@@ -65,6 +76,8 @@ class SACLoss(TorchRLSACLoss):
         alpha_init: float = 1e-2,
         target_entropy: float = -5.0,
         gamma: float = 0.99,
+        importance_weights: bool = True,
+        generator: torch.Generator | None = None,
     ):
         if not isinstance(critic, TensorDictSequential) or len(critic.module) != 2:
             raise TypeError(
@@ -86,27 +99,43 @@ class SACLoss(TorchRLSACLoss):
             # TorchRL would weight the actor's and the temperature's losses as well.
             use_prioritized_weights=False,
         )
+        self.importance_weights = importance_weights
+        self.generator = generator
         self._backward_at_once = False
         self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
         # Reading it once turns the lazy attribute into a buffer, part of the state dict.
         _ = self.target_entropy
 
     def _make_vmap(self) -> None:
-        """Replaces TorchRL's vmap over copies of a Q-network by one call of ours."""
+        """Replaces TorchRL's vmap over copies of a Q-network, in targets, by one call of ours."""
 
-        def all_heads(tensordict: TensorDictBase, params: TensorDictParams) -> TensorDict:
+        def target_heads(tensordict: TensorDictBase, params: TensorDictParams) -> TensorDict:
             with params.to_module(self.qvalue_network, preserve_module_state=False):
                 values = self.qvalue_network(tensordict.copy())
             q = values.get(self.tensor_keys.state_action_value)
+            if q.shape[-1] > 2:
+                q = q[..., torch.randperm(q.shape[-1], generator=self.generator)[:2]]
             stacked = {self.tensor_keys.state_action_value: q.movedim(-1, 0).unsqueeze(-1)}
             return TensorDict(stacked, [q.shape[-1], *tensordict.batch_size])
 
-        self._vmap_qnetworkN0 = all_heads
+        self._vmap_qnetworkN0 = target_heads
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The losses of a batch, see the class."""
         with shared_filters():
-            return super().forward(tensordict)
+            loss_qvalue, critic = self.qvalue_v2_loss(tensordict)
+            loss_actor, actor = self.actor_loss(tensordict)
+        tensordict.set(self.tensor_keys.priority, critic["td_error"])
+        log_prob = actor["log_prob"]
+        losses = {
+            "loss_actor": loss_actor,
+            "loss_qvalue": loss_qvalue,
+            "loss_alpha": self._alpha_loss(log_prob).mean(),
+            "alpha": self._alpha,
+            "entropy": -log_prob.mean(),
+        }
+        further = {key: value for key, value in actor.items() if key.startswith("loss_")}
+        return TensorDict(losses | further)
 
     def backward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The losses of a batch, their gradients accumulated in the parameters.
@@ -119,7 +148,8 @@ class SACLoss(TorchRLSACLoss):
             losses = self(tensordict)
         finally:
             self._backward_at_once = False
-        (losses["loss_actor"] + losses["loss_alpha"]).backward()
+        left = [value for key, value in losses.items() if key.startswith("loss_")]
+        torch.stack([loss for loss in left if loss.requires_grad]).sum().backward()
         return losses
 
     def qvalue_v2_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
@@ -132,14 +162,22 @@ class SACLoss(TorchRLSACLoss):
         for key in encoder.out_keys:
             tensordict.set(key, values.get(key).detach())
         error = values.get(self.tensor_keys.state_action_value) - target.unsqueeze(-1)
-        loss = error.pow(2).mean(0).sum()
+        squared = error.pow(2)
+        weights = tensordict.get(self.tensor_keys.priority_weight, None)
+        if self.importance_weights and weights is not None:
+            squared = squared * weights.to(squared).reshape(-1, 1)
+        loss = squared.mean(0).sum()
         if self._backward_at_once:
             loss.backward()
             loss = loss.detach()
         return loss, {"td_error": error.detach().abs().mean(-1)}
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Mean of alpha log pi(a|s) - min_i Q_i(s, a) over reparameterised actions a."""
+        """Mean of alpha log pi(a|s) - min_i Q_i(s, a) over reparameterised actions a.
+
+        Returns:
+            The loss; ``log_prob`` (B,), detached, and the ``action`` (B, dim) itself.
+        """
         with (
             set_exploration_type(ExplorationType.RANDOM),
             self.actor_network_params.to_module(self.actor_network, preserve_module_state=False),
@@ -152,5 +190,7 @@ class SACLoss(TorchRLSACLoss):
             self.qvalue_network, preserve_module_state=False
         ):
             heads(values)
-        q = values.get(self.tensor_keys.state_action_value).min(-1).values
-        return (self._alpha * log_prob - q).mean(), {"log_prob": log_prob.detach()}
+        estimates = values.get(self.tensor_keys.state_action_value)
+        q = estimates.mean(-1) if estimates.shape[-1] > 2 else estimates.min(-1).values
+        loss = (self._alpha * log_prob - q).mean()
+        return loss, {"log_prob": log_prob.detach(), "action": action}
