@@ -1,18 +1,22 @@
-"""Replay-buffer transforms: what happens to transitions between insertion and sampling."""
+"""Replay-buffer transforms of images: how depth is stored, and random windows of it."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
+from torch import Tensor
 from torchrl.envs import Transform
 
-from equirl.symmetry import SymmetrySpec, manipulation_spec
+__all__ = ["QuantizeDepth", "RandomCrop"]
 
-__all__ = ["QuantizeDepth", "RotationAugmentation"]
+
+def _with_next(keys: Sequence[str]) -> list[NestedKey]:
+    """The keys of an observation, then those of the next one."""
+    return [*keys, *(("next", key) for key in keys)]
 
 
 class QuantizeDepth(Transform):
@@ -35,8 +39,8 @@ class QuantizeDepth(Transform):
     def __init__(self, maximum: float, in_keys: Sequence[str] = ("depth",)):
         if not 0 < maximum < math.inf:
             raise ValueError(f"maximum={maximum!r}: expected a depth above 0, m")
-        nested = [*in_keys, *(("next", key) for key in in_keys)]
-        super().__init__(in_keys=nested, out_keys=nested, in_keys_inv=nested, out_keys_inv=nested)
+        keys = _with_next(in_keys)
+        super().__init__(in_keys=keys, out_keys=keys, in_keys_inv=keys, out_keys_inv=keys)
         self.maximum = maximum
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -58,90 +62,67 @@ class QuantizeDepth(Transform):
         return tensordict
 
 
-class RotationAugmentation(Transform):
-    """Buffer augmentation: n rotated copies of every stored transition (paper, appendix F).
+class RandomCrop(Transform):
+    """A random window of the images of each sampled transition (paper, appendix G.3: RAD, FERM).
 
-    Each copy is the transition with observation, next observation and action turned by
-    its own angle, uniform in [0, 2 pi). The angles are drawn once, at insertion; the
-    rotation itself is applied when a copy is sampled. Sampling a stored row uniformly
-    and then one of its n + 1 versions uniformly is the same distribution as storing
-    every copy, for a fraction 1 / (n + 1) of the memory.
-
-    It is a transform of any TorchRL replay buffer that is filled by ``extend``, one row a
-    transition; `docs/custom_pipeline.md` shows one.
+    Observation and next observation of a transition are cropped by the same window, all its
+    positions equally likely. Nothing is done at insertion: whole images are stored.
 
     Args:
-        copies: Rotated copies a transition, n >= 0.
-        spec: How each key transforms; that of planar manipulation when None. Every
-            transition must have the keys it names.
-        generator: Source of the angles and of the choice among copies.
-        bounds: Keys whose turned values are clipped, with lowest and highest value; when
-            None, ``action`` to [-1, 1] if the spec names it. An action whose (x, y) lies off
-            the unit disc can leave its box when turned, and the paper's system clips it; on
-            the disc, where ``strict`` actions live, nothing is clipped.
+        size: Rows and columns of the window, in pixels.
+        positives: Also write ``"positive"``, a second window of the observation's ``depth``
+            drawn independently of the first: what the contrastive loss of FERM is to
+            recognise.
+        generator: Source of the windows, a CPU generator.
 
     Raises:
-        ValueError: ``copies`` is negative; at insertion, a key is missing or the batch has
-            several dimensions; at sampling, what is to be turned does not hold floats.
+        ValueError: The size is not an integer of 1 or more; at sampling, the images are smaller
+            than the window.
     """
 
-    ANGLES = "augmentation_angles"
+    POSITIVE = "positive"
 
     def __init__(
         self,
-        copies: int,
+        size: int,
         *,
-        spec: SymmetrySpec | None = None,
+        positives: bool = False,
         generator: torch.Generator | None = None,
-        bounds: Mapping[NestedKey, tuple[float, float]] | None = None,
     ):
-        if not isinstance(copies, int) or copies < 0:
-            raise ValueError(f"copies={copies!r}: expected an integer of 0 or more")
-        super().__init__()
-        self.copies = copies
-        self.spec = manipulation_spec() if spec is None else spec
+        if not isinstance(size, int) or size < 1:
+            raise ValueError(f"size={size!r}: expected an integer of 1 or more")
+        keys = _with_next(["depth"])
+        super().__init__(in_keys=keys, out_keys=[*keys, self.POSITIVE] if positives else keys)
+        self.size = size
+        self.positives = positives
         self.generator = generator
-        if bounds is None:
-            bounds = {"action": (-1.0, 1.0)} if "action" in self.spec.keys else {}
-        self.bounds = dict(bounds)
-
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        missing = [key for key in self.spec.keys if tensordict.get(key, None) is None]
-        if missing:
-            raise ValueError(
-                f"the symmetry names {missing}, which these transitions do not have: "
-                f"{sorted(map(str, tensordict.keys()))}"
-            )
-        if tensordict.batch_dims > 1:
-            raise ValueError(
-                "expected one row a transition, got a batch of size "
-                f"{tuple(tensordict.batch_size)}: extend the buffer with data.reshape(-1)"
-            )
-        out = tensordict.clone(recurse=False)
-        angles = torch.zeros(*tensordict.batch_size, self.copies + 1)
-        drawn = torch.rand(*tensordict.batch_size, self.copies, generator=self.generator)
-        angles[..., 1:] = math.tau * drawn
-        return out.set(self.ANGLES, angles)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Turns each row of a sampled batch (B,) into one of its n + 1 versions."""
-        if not self.copies:
-            return tensordict.exclude(self.ANGLES)
-        for key in self.spec.keys:
-            dtype = tensordict.get(key).dtype
-            if not dtype.is_floating_point:
-                raise ValueError(
-                    f"{key} is of {dtype} and cannot be turned: expected floats; images get "
-                    "them from TorchRL's ToTensorImage, for example"
-                )
-        angles = tensordict.pop(self.ANGLES)
-        (batch,) = tensordict.batch_size
-        copy = torch.randint(self.copies + 1, (batch,), generator=self.generator)
-        rows = copy.nonzero().squeeze(-1).to(angles.device)
-        if len(rows) == 0:
-            return tensordict
-        turned = self.spec.rotate(tensordict[rows], angles[rows, copy[rows]])
-        for key, (lowest, highest) in self.bounds.items():
-            turned.set(key, turned.get(key).clamp(lowest, highest))
-        tensordict[rows] = turned
+        """Crops the images of a sampled batch (B,), each (B, C, H, W), to (B, C, size, size)."""
+        depth = tensordict.get("depth")
+        window = self._draw(depth)
+        for key in self.in_keys:
+            tensordict.set(key, self._crop(tensordict.get(key), window))
+        if self.positives:
+            tensordict.set(self.POSITIVE, self._crop(depth, self._draw(depth)))
         return tensordict
+
+    def _draw(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """First row and first column of a window for each image, (B,) each."""
+        rows, columns = image.shape[-2:]
+        if min(rows, columns) < self.size:
+            raise ValueError(
+                f"images of {rows} x {columns} pixels cannot be cropped to {self.size} x "
+                f"{self.size}: expected images at least as large"
+            )
+        top, left = (
+            torch.randint(length - self.size + 1, image.shape[:1], generator=self.generator)
+            for length in (rows, columns)
+        )
+        return top.to(image.device), left.to(image.device)
+
+    def _crop(self, image: Tensor, window: tuple[Tensor, Tensor]) -> Tensor:
+        # A view of all windows, (B, C, tops, lefts, size, size), of which one each is copied.
+        windows = image.unfold(-2, self.size, 1).unfold(-2, self.size, 1)
+        rows = torch.arange(len(image), device=image.device)
+        return windows[rows, :, *window]

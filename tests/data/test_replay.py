@@ -6,6 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.envs import Transform
 
 from equirl.data import (
     TRANSITION_KEYS,
@@ -138,6 +139,32 @@ def test_state_restores_rows_cursor_and_draws():
         buffer.extend(transitions(1, seed=9))
         other.extend(transitions(1, seed=9))
     assert (buffer.storage[:] == other.storage[:]).all()
+
+
+class Recorder(Transform):
+    """Notes in ``seen`` the depths that reach it, and adds 1 m."""
+
+    def __init__(self, seen):
+        super().__init__()
+        self.seen = seen
+
+    def forward(self, tensordict):
+        self.seen.append(tensordict["depth"].clone())
+        return tensordict.set("depth", tensordict["depth"] + 1)
+
+
+def test_augmentations_follow_the_rotated_copies_in_their_order():
+    seen = []
+    plain, buffer = (
+        make_replay_buffer(1000, batch_size=16, generator=generator(), augmentations=augmentations)
+        for augmentations in ([], [Recorder(seen), Recorder(seen)])
+    )
+    for each in (plain, buffer):
+        each.extend(transitions(20))
+    assert seen == []  # nothing happens at insertion
+    turned, batch = plain.sample()["depth"], buffer.sample()["depth"]
+    assert torch.equal(seen[0], turned)
+    assert torch.equal(seen[1], turned + 1) and torch.equal(batch, turned + 1 + 1)
 
 
 def test_bad_arguments_are_named():
