@@ -120,10 +120,11 @@ def _mendable() -> tuple[type[Exception], ...]:
     """Errors that say by themselves what the user can do."""
     from equirl.analysis import TableError
     from equirl.collectors import DemonstrationError
+    from equirl.data import DatasetError
     from equirl.envs import PlacementError
     from equirl.training import CheckpointError, ExportError, FolderError
 
     return (
         *(ConfigError, FolderError, CheckpointError, TableError),
-        *(DemonstrationError, ExportError, PlacementError),
+        *(DatasetError, DemonstrationError, ExportError, PlacementError),
     )

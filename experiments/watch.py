@@ -3,12 +3,14 @@
 python experiments/watch.py env=block_pushing policy=expert
 python experiments/watch.py env=clutter_grasping policy=random env.options.object_count=10
 python experiments/watch.py policy=outputs/demo episodes=5
+python experiments/watch.py policy=demos.hdf5
 """
 
 from __future__ import annotations
 
 import sys
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,25 +27,31 @@ if TYPE_CHECKING:
 
 @entry_point("watch", WatchJob)
 def main(job: WatchJob) -> None:
-    """Plays episodes, says how they ended and where the pictures are."""
+    """Plays episodes, or reads them, says how they ended and where the pictures are."""
     from equirl.training import load_policy, make_run_env
 
     if job.policy in ("expert", "random"):
         config, policy = Config(env=job.env), None
     else:
-        _check_run(job.policy)
+        _check_path(job.policy)
+        if Path(job.policy).is_file():
+            _watch_file(job)
+            return
         config, policy = load_policy(job.policy, "auto", "auto")
     with closing(make_run_env(config)) as env:
         _watch(job, config, env, policy or _scripted(job.policy, env, job.seed))
 
 
-def _check_run(folder: str) -> None:
-    """Refuses what is no policy, and keys that the run of a learned policy settles."""
-    if not Path(folder).is_dir():
-        raise ConfigError(f"policy={folder}: expected expert, random or the folder of a run")
+def _check_path(path: str) -> None:
+    """Refuses what is no policy, and keys that a run or a file settles."""
+    if not Path(path).exists():
+        raise ConfigError(
+            f"policy={path}: expected expert, random, the folder of a run or a file of "
+            "demonstrations"
+        )
     for text in HydraConfig.get().overrides.task:
         if text.startswith("env"):
-            raise ConfigError(f"{text}: leave it out, policy={folder} is watched in its own task")
+            raise ConfigError(f"{text}: leave it out, policy={path} is watched in its own task")
 
 
 def _scripted(name: str, env: ManipulationEnv, seed: int) -> TensorDictModuleBase:
@@ -71,13 +79,9 @@ def _watch(
     from equirl.training.sheet import draw_sheet, outcome
     from equirl.training.video import open_film, record
 
-    task = config.env.task
-    folder = Path(job.output or f"outputs/watch/{task}/{Path(job.policy).name}".replace(":", "."))
-    film, sheet = folder / "film.mp4", folder / "sheet.png"
     shown = []
     env.set_seed(job.seed)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
+    with _pictures(job, config.env.task, Path(job.policy).name) as (film, sheet):
         with open_film(film, fps=job.fps) as add:
             for number in range(1, job.episodes + 1):
                 scene = ", the scene goes on" if env.scene_continues else ""
@@ -89,6 +93,44 @@ def _watch(
                     shown.append(frames)
         title = f"{describe_task(config)}: {job.policy}"
         draw_sheet(shown, env, sheet, title=title)
+
+
+def _watch_file(job: WatchJob) -> None:
+    """Says how each episode of a file ended, and draws the first ones; nothing is simulated."""
+    from equirl.data.episodes import DatasetError
+    from equirl.data.robomimic import read_demonstrations, read_environment
+    from equirl.training.demonstrations import recorded_frames
+    from equirl.training.sheet import Setting, draw_sheet, outcome
+    from equirl.training.video import open_film
+
+    path = Path(job.policy)
+    try:
+        about = read_environment(path)
+        episodes = [recorded_frames(each) for each in read_demonstrations(path, failed=True)]
+    except DatasetError as error:
+        raise ConfigError(f"policy={error}") from None
+    task = about.get("task", "demonstrations")
+    # Others do not say how wide their pictures are: as in most of our tasks.
+    setting = Setting(about.get("view", 0.30), about.get("max_steps", 0))
+    for number, frames in enumerate(episodes, start=1):
+        print(f"episode {number}: {outcome(frames, setting)}")
+    with _pictures(job, task, path.stem) as (film, sheet):
+        with open_film(film, fps=job.fps, side=job.size) as add:
+            for frames in episodes[: job.episodes]:
+                for frame in frames:
+                    add(frame)
+        title = f"{task}: {path.name}".replace("_", " ").capitalize()
+        draw_sheet(episodes[: job.sheet_episodes], setting, sheet, title=title)
+
+
+@contextmanager
+def _pictures(job: WatchJob, task: str, policy: str) -> Iterator[tuple[Path, Path]]:
+    """Makes the folder of film and sheet, and says where they are."""
+    folder = Path(job.output or f"outputs/watch/{task}/{policy}".replace(":", "."))
+    film, sheet = folder / "film.mp4", folder / "sheet.png"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield film, sheet
     except OSError as error:
         sys.exit(f"error: cannot write output={folder}: {error}")
     print(f"film: {film}\nsheet: {sheet}")

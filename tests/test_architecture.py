@@ -39,6 +39,7 @@ CONFINED = {
     "coacd": "envs/objects/convex_pieces.py",
     "tqdm": "training/progress.py",
     "onnxruntime": "training/export",
+    "h5py": "data/robomimic.py",
 }
 
 

@@ -1,7 +1,14 @@
 """The configuration of a run: typed, validated, and the same with or without Hydra."""
 
 from equirl.config.declare import ConfigError, flatten
-from equirl.config.jobs import EvaluateJob, ExportJob, ReportJob, TrainJob, WatchJob
+from equirl.config.jobs import (
+    DemonstrationsJob,
+    EvaluateJob,
+    ExportJob,
+    ReportJob,
+    TrainJob,
+    WatchJob,
+)
 from equirl.config.reading import (
     explain,
     load_config,
@@ -15,6 +22,7 @@ from equirl.config.schema import Config, is_free
 __all__ = [
     "Config",
     "ConfigError",
+    "DemonstrationsJob",
     "EvaluateJob",
     "ExportJob",
     "ReportJob",

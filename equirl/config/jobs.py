@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 from omegaconf import MISSING
 
 from equirl.config.declare import ConfigError, at_least, checked, keys_of, one_of
 from equirl.config.schema import BACKENDS_SOURCE, Config, EnvConfig, make_run_task
 
-__all__ = ["EvaluateJob", "ExportJob", "ReportJob", "TrainJob", "WatchJob"]
+__all__ = ["DemonstrationsJob", "EvaluateJob", "ExportJob", "ReportJob", "TrainJob", "WatchJob"]
 
 
 @dataclass
@@ -18,6 +20,40 @@ class TrainJob(Config):
 
     output: str = ""  # the run's folder; a new one under outputs/ when empty
     resume: str = ""  # folder of an interrupted run to go on with
+
+
+@dataclass
+class DemonstrationsJob:
+    """What the command line of ``experiments/demonstrations.py`` takes."""
+
+    env: EnvConfig = keys_of(EnvConfig)
+    expert: dict[str, Any] = field(default_factory=dict)  # CHOICES of the task's expert
+    mode: str = one_of("strict", source="equirl.symmetry.spec:MODES")  # of expert and time limit
+    episodes: int = at_least(20, 1)
+    seed: int = at_least(0, 0)  # the scenes are those of the run of this seed
+    output: str = MISSING  # the file, HDF5
+    overwrite: bool = False  # a file that is there already
+
+    def validated(self) -> DemonstrationsJob:
+        """This job, if its task and expert exist and its file may be written.
+
+        Raises:
+            ConfigError: They do not, or it may not.
+        """
+        path, task = Path(self.output), make_run_task(self.env)
+        if task.expert is None:
+            raise ConfigError(f"env.task={self.env.task}: it has no expert to demonstrate it")
+        try:
+            task.expert.resolve(self.expert)
+        except ValueError as error:
+            raise ConfigError(f"expert: {error}") from None
+        if path.is_dir():
+            raise ConfigError(f"output={path}: it is a folder, expected the name of a file")
+        if path.exists() and not self.overwrite:
+            raise ConfigError(
+                f"output={path}: it exists already; choose another, or overwrite=true"
+            )
+        return self
 
 
 @dataclass
@@ -92,8 +128,9 @@ class WatchJob:
     """What the command line of ``experiments/watch.py`` takes."""
 
     env: EnvConfig = keys_of(EnvConfig)
-    policy: str = "expert"  # or "random", or the folder of a run, whose environment is then used
-    episodes: int = at_least(3, 1)
+    # Or "random"; the folder of a run, whose environment is then used; a file of demonstrations.
+    policy: str = "expert"
+    episodes: int = at_least(3, 1)  # filmed; of a file, the first ones
     sheet_episodes: int = at_least(3, 1)  # the first ones, shown on the contact sheet
     seed: int = at_least(0, 0)
     output: str = ""  # a folder for film and sheet; outputs/watch/<task>/<policy> when empty

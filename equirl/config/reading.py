@@ -18,7 +18,14 @@ from omegaconf.errors import (
 from yaml import YAMLError
 
 from equirl.config.declare import ConfigError, check_values, flatten
-from equirl.config.jobs import EvaluateJob, ExportJob, ReportJob, TrainJob, WatchJob
+from equirl.config.jobs import (
+    DemonstrationsJob,
+    EvaluateJob,
+    ExportJob,
+    ReportJob,
+    TrainJob,
+    WatchJob,
+)
 from equirl.config.schema import Config
 
 __all__ = [
@@ -131,13 +138,16 @@ def register() -> None:
 
     OmegaConf.register_new_resolver("shortened", _shortened, replace=True)
     store = ConfigStore.instance()
-    for name, schema in (("train_schema", TrainJob), ("watch_schema", WatchJob)):
+    schemas = {"train": TrainJob, "watch": WatchJob, "demonstrations": DemonstrationsJob}
+    for name, schema in schemas.items():
         node = OmegaConf.structured(schema)
         # The task and its expert check the names of their options themselves.
         OmegaConf.set_struct(node.env.options, False)
         if "demos" in node:
             OmegaConf.set_struct(node.demos.options, False)
-        store.store(name=name, node=node)
+        if "expert" in node:
+            OmegaConf.set_struct(node.expert, False)
+        store.store(name=f"{name}_schema", node=node)
     store.store(name="evaluate_schema", node=EvaluateJob)
     store.store(name="export_schema", node=ExportJob)
     store.store(name="report_schema", node=ReportJob)

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from equirl.envs import Action, ManipulationEnv
+from equirl.envs.workspace import WORKSPACE, Workspace
 from equirl.training.video import COLORS, EXPONENT, Frame
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.image import AxesImage
 
-__all__ = ["draw_sheet", "outcome"]
+__all__ = ["Setting", "draw_sheet", "outcome"]
 
 _DPI = 100
 # Lengths on paper, inches.
@@ -39,14 +41,40 @@ _LEGEND = (
 )
 
 
+@dataclass(frozen=True)
+class Setting:
+    """What a sheet has to know of an environment; of a recording, there is no more.
+
+    Attributes:
+        view: Length of a side of the depth image, m.
+        max_steps: Of an episode without success; 0 when it is not known.
+        workspace: How far actions go.
+    """
+
+    view: float
+    max_steps: int = 0
+    workspace: Workspace = WORKSPACE
+
+    @classmethod
+    def of(cls, env: ManipulationEnv | Setting) -> Setting:
+        """The setting of an environment."""
+        if isinstance(env, Setting):
+            return env
+        return cls(env.task.view, env.max_steps, env.workspace)
+
+
 def draw_sheet(
-    episodes: Sequence[Sequence[Frame]], env: ManipulationEnv, path: Path, *, title: str = ""
+    episodes: Sequence[Sequence[Frame]],
+    env: ManipulationEnv | Setting,
+    path: Path,
+    *,
+    title: str = "",
 ) -> Path:
     """Writes a contact sheet as a PNG file.
 
     Args:
-        episodes: What `record` returned for each.
-        env: Where they were played.
+        episodes: What `record` returned for each, or `recorded_frames`.
+        env: Where they were played, or what is known of it.
         path: The file to write.
         title: Above everything.
 
@@ -56,7 +84,8 @@ def draw_sheet(
     Raises:
         OSError: The file cannot be written.
     """
-    sizes = [len(frames) + 2 for frames in episodes]  # the scene is shown at the start and the end
+    setting = Setting.of(env)
+    sizes = [len(frames) + 2 * _has_scene(frames) for frames in episodes]
     columns = _columns(sizes)
     rows = [math.ceil(size / columns) for size in sizes]
     pitch = _TILE + 2 * _CAPTION + _GAP
@@ -66,22 +95,30 @@ def draw_sheet(
     page.write(_MARGIN, _MARGIN, title, size=13, weight="bold")
     top = _MARGIN + _TITLE
     for number, (frames, count) in enumerate(zip(episodes, rows, strict=True), start=1):
-        page.write(_MARGIN, top, f"Episode {number}: {outcome(frames, env)}", size=10)
+        page.write(_MARGIN, top, f"Episode {number}: {outcome(frames, setting)}", size=10)
         top += _HEADING
-        for index in range(len(frames) + 2):
-            row, column = divmod(index, columns)
-            left = _MARGIN + column * (_TILE + _GAP)
-            axes = page.picture(left, top + row * pitch + _CAPTION)
-            if index == 0:
-                _show_scene(axes, frames[0], "the scene at the start")
-            elif index == len(frames) + 1:
-                _show_scene(axes, frames[-1], "the scene at the end")
-            else:
-                image = _show_depth(axes, frames[index - 1], index - 1, env)
+        places = (
+            page.picture(
+                _MARGIN + index % columns * (_TILE + _GAP),
+                top + index // columns * pitch + _CAPTION,
+            )
+            for index in range(len(frames) + 2)
+        )
+        if _has_scene(frames):
+            _show_scene(next(places), frames[0], "the scene at the start")
+        for step, frame in enumerate(frames):
+            image = _show_depth(next(places), frame, step, setting)
+        if _has_scene(frames):
+            _show_scene(next(places), frames[-1], "the scene at the end")
         top += count * pitch
     page.explain(top, image)
     page.save(path)
     return path
+
+
+def _has_scene(frames: Sequence[Frame]) -> bool:
+    """Whether there are pictures of the scene, which are shown at the start and the end."""
+    return frames[0].picture is not None
 
 
 def _columns(sizes: Sequence[int]) -> int:
@@ -92,7 +129,7 @@ def _columns(sizes: Sequence[int]) -> int:
     return min(choices, key=lambda count: sum(-size % count for size in sizes))
 
 
-def outcome(frames: Sequence[Frame], env: ManipulationEnv) -> str:
+def outcome(frames: Sequence[Frame], env: ManipulationEnv | Setting) -> str:
     """How an episode in ``env`` ended, in words."""
     count = len(frames) - 1
     steps = f"{count} step{'s' if count > 1 else ''}"
@@ -150,6 +187,7 @@ def _wrapped(text: str, width: int) -> str:
 
 
 def _show_scene(axes: Axes, frame: Frame, caption: str) -> None:
+    assert frame.picture is not None
     axes.imshow(frame.picture)
     _write(axes, 0, True, caption, color=_FAINT)
 
@@ -160,10 +198,10 @@ def _write(axes: Axes, x: float, above: bool, text: str, **style: Any) -> None:
     axes.text(x, y, text, va=side, transform=axes.transAxes, size=8.5, **style)
 
 
-def _show_depth(axes: Axes, frame: Frame, step: int, env: ManipulationEnv) -> AxesImage:
+def _show_depth(axes: Axes, frame: Frame, step: int, setting: Setting) -> AxesImage:
     from matplotlib.colors import PowerNorm
 
-    half = env.task.view / 2
+    half = setting.view / 2
     image = axes.imshow(
         frame.depth,
         cmap=COLORS,
@@ -181,11 +219,11 @@ def _show_depth(axes: Axes, frame: Frame, step: int, env: ManipulationEnv) -> Ax
         middle = 0.9 * half - _BAR / 2
         axes.text(middle, 0.84 * half, "10 cm", color="white", size=8, ha="center", va="bottom")
     if frame.action is not None:
-        _show_action(axes, frame.action, env)
+        _show_action(axes, frame.action, setting)
     return image
 
 
-def _show_action(axes: Axes, action: np.ndarray, env: ManipulationEnv) -> None:
+def _show_action(axes: Axes, action: np.ndarray, env: ManipulationEnv | Setting) -> None:
     """Draws the displacement in x and y as an arrow and writes the rest below."""
     space = env.workspace
     wanted = Action(*action.tolist())

@@ -28,7 +28,7 @@ class Frame:
     """A moment of an episode.
 
     Attributes:
-        picture: Of the scene, shape (P, P, 3), uint8.
+        picture: Of the scene, shape (P, P, 3), uint8; None of a recording, which has none.
         depth: What the network sees, shape (S, S), in metres below the end effector.
         deepest: The floor's depth with the gripper at the top of the workspace, m.
         holding: Whether the gripper holds an object; the network is told.
@@ -36,7 +36,7 @@ class Frame:
         action: What the policy then does, shape (5,); None at the end.
     """
 
-    picture: np.ndarray
+    picture: np.ndarray | None
     depth: np.ndarray
     deepest: float
     holding: bool
@@ -115,12 +115,14 @@ def film_policy(
 
 
 @contextmanager
-def open_film(path: Path, *, fps: int = 4) -> Iterator[Callable[[Frame], None]]:
+def open_film(path: Path, *, fps: int = 4, side: int = _SIDE) -> Iterator[Callable[[Frame], None]]:
     """Opens an MP4 file and gives the function that adds a frame to it.
 
     Args:
         path: The file to write.
         fps: Frames a second.
+        side: Pixels a side of frames that have no picture of the scene; others are as large as
+            their pictures.
 
     Raises:
         OSError: The file cannot be written.
@@ -131,18 +133,25 @@ def open_film(path: Path, *, fps: int = 4) -> Iterator[Callable[[Frame], None]]:
     path.open("wb").close()  # the encoder is a process of its own and would fail in silence
     writer: Any = imageio.get_writer(path, fps=fps, macro_block_size=None, quality=7)
     with writer:
-        yield lambda frame: writer.append_data(np.hstack([frame.picture, _depth_picture(frame)]))
+        yield lambda frame: writer.append_data(_film_picture(frame, side))
     try:
         imageio_ffmpeg.count_frames_and_secs(path)
     except RuntimeError:
         raise OSError(f"{path} could not be written; is the disk full?") from None
 
 
-def _depth_picture(frame: Frame) -> np.ndarray:
-    """The depth image in colours, as large as the picture of the scene; pixels kept sharp."""
+def _film_picture(frame: Frame, side: int) -> np.ndarray:
+    """The scene beside what the network sees; only this where there is no picture of the scene."""
+    if frame.picture is None:
+        return _depth_picture(frame, side)
+    return np.hstack([frame.picture, _depth_picture(frame, len(frame.picture))])
+
+
+def _depth_picture(frame: Frame, side: int) -> np.ndarray:
+    """The depth image in colours, (side, side, 3); pixels kept sharp."""
     import matplotlib
 
     share = np.clip(frame.depth / frame.deepest, 0, 1) ** EXPONENT
     colors = (matplotlib.colormaps[COLORS](share)[..., :3] * 255).astype(np.uint8)
-    index = np.arange(len(frame.picture)) * len(colors) // len(frame.picture)
+    index = np.arange(side) * len(colors) // side
     return colors[index][:, index]

@@ -5,12 +5,16 @@ import sys
 from pathlib import Path
 
 import imageio.v2 as imageio
+import numpy as np
 import object_sheet
 import pytest
+import torch
 import watch as watch_script
 
 from equirl.config import to_config
+from equirl.data.robomimic import write_demonstrations
 from tests.commands import frames_of
+from tests.transitions import transitions
 
 SMALL = ["env.image_size=16", "env.robot=hand", "size=32"]
 
@@ -31,15 +35,27 @@ def watch(monkeypatch, capsys):
     return call
 
 
-def check(folder: Path, printed: str, side: int) -> None:
-    """The film has a frame a step and one more an episode; the sheet shows something."""
+def check(folder: Path, printed: str, side: int, *, filmed: int | None = None) -> np.ndarray:
+    """The film has a frame a step and one more an episode; the sheet shows something.
+
+    Args:
+        folder: Where they are.
+        printed: What was said.
+        side: Pixels of a picture.
+        filmed: Of a file: how many of its episodes are filmed, without pictures of the scene.
+
+    Returns:
+        The frames.
+    """
     assert f"film: {folder / 'film.mp4'}" in printed
     assert f"sheet: {folder / 'sheet.png'}" in printed
-    lengths = [int(steps) for steps in re.findall(r"episode \d.* (\d+) step", printed)]
+    lengths = [int(steps) for steps in re.findall(r"episode \d.* (\d+) step", printed)][:filmed]
     pictures = frames_of(folder / "film.mp4", side)
+    pictures = pictures.reshape(-1, side, side, 3) if filmed else pictures
     assert len(pictures) == sum(lengths) + len(lengths) and pictures[0].std() > 10
     sheet = imageio.imread(folder / "sheet.png")
     assert sheet.shape[1] > 800 and sheet.std() > 30
+    return pictures
 
 
 def test_the_expert(watch, tmp_path):
@@ -85,10 +101,40 @@ def test_the_policy_of_a_run_in_its_own_environment(watch, tmp_path, monkeypatch
     check(output, printed, 32)
 
 
+def test_a_file_of_demonstrations(watch, tmp_path, monkeypatch):
+    """Each of its episodes is named, the first ones are drawn; nothing is simulated."""
+    path = tmp_path / "demos.hdf5"
+    episodes = [transitions(steps, seed=steps) for steps in (3, 3, 4)]
+    for episode, reward in zip(episodes, (1, 0, 1), strict=True):
+        episode["next", "reward"] = torch.eye(len(episode))[:, -1:] * reward
+    environment = {"task": "block_pushing", "view": 0.45, "max_steps": 3}
+    write_demonstrations(path, episodes, environment=environment)
+    assert "env.image_size=16: leave it out" in watch(f"policy={path}")
+    monkeypatch.setattr(sys.modules[__name__], "SMALL", ["size=32"])
+    monkeypatch.setattr("equirl.envs.ManipulationEnv.__init__", None)
+    monkeypatch.chdir(tmp_path)
+    printed = watch(f"policy={path}", "episodes=2", "sheet_episodes=1")
+    said = ["success after 3 steps", "no success in 3 steps", "success after 4 steps"]
+    assert re.findall(r"episode \d: (.*)", printed) == said
+    frames = check(Path("outputs", "watch", "block_pushing", "demos"), printed, 32, filmed=2)
+    seen = [*episodes[0]["depth"], episodes[0]["next", "depth"][-1], *episodes[1]["depth"]]
+    for frame, depth in zip(frames, seen, strict=False):  # near is bright
+        brightness = frame.mean(-1).reshape(16, 2, 16, 2).mean((1, 3))
+        assert np.corrcoef(brightness.ravel(), -depth.numpy().ravel())[0, 1] > 0.9
+
+
+def test_a_file_that_holds_no_demonstrations_is_told(watch, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "SMALL", [])
+    (tmp_path / "notes.txt").write_text("not a dataset")
+    complaint = watch(f"policy={tmp_path / 'notes.txt'}")
+    assert f"error: policy={tmp_path / 'notes.txt'}: not an HDF5 file" in complaint
+    assert "Traceback" not in complaint
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["policy=exprt"], "policy=exprt: expected expert, random or the folder of a run"),
+        (["policy=exprt"], "policy=exprt: expected expert, random, the folder of a run or a file"),
         (["colour=red"], "colour"),
         (["env=block_stacking"], "block_stacking"),
         (["env.options.colour=red"], "BlockPicking has no option colour"),
