@@ -47,7 +47,7 @@ def _latency(job: ExportJob, repeats: int = 200) -> str:
     torch.set_num_threads(1)
     config, actor = load_policy(job.run, "cpu", "auto")
     original, exported = as_function(actor), load_exported(job.check, threads=1)
-    size = config.env.image_size
+    size = config.observed_size
     seen = Observations(torch.rand(1, 1, size, size).numpy(), torch.zeros(1, 1).numpy())
     with shared_filters():  # expanded once, as while a run acts
         seconds = take_turns(

@@ -75,7 +75,7 @@ def observe(job: ReportJob, config: Config, state: dict[str, Any]) -> dict[str, 
 
     with closing(make_run_env(config)) as env:
         depth = env.observation_spec["depth"].high.max().item()
-    size, stored = config.env.image_size, state["buffer"]
+    size, stored = config.observed_size, state["buffer"]
     rows = TensorDict(stored["rows"], batch_size=[stored["size"]])
     return {
         "random": random_observations(job.observations, size, max_depth=depth, seed=job.seed),

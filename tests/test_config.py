@@ -41,6 +41,43 @@ def test_copies_are_those_of_the_augmentation_in_use():
     assert to_config(GOOD | {"augmentation": {"name": "none"}}).copies == 0
 
 
+@pytest.mark.parametrize(
+    ("algorithm", "asked", "sampling"),
+    [
+        ("sac", "auto", "uniform"),
+        ("sacfd", "auto", "prioritized"),
+        ("sacfd", "symmetric", "symmetric"),
+        ("sac", "prioritized", "prioritized"),
+    ],
+)
+def test_sampling_is_the_algorithms_own_unless_asked_for(algorithm, asked, sampling):
+    changes = {"algorithm": {"name": algorithm}, "replay": {"sampling": asked}}
+    assert to_config(GOOD | changes).sampling == sampling
+
+
+@pytest.mark.parametrize(
+    ("method", "size", "observed"),
+    [("cnn", 128, 128), ("rad", 128, 142), ("ferm", 64, 72), ("rad", 16, 18)],
+)
+def test_methods_that_crop_are_shown_more_than_they_see(method, size, observed):
+    changes = {
+        "method": {"name": method},
+        "env": {"task": "block_picking", "image_size": size},
+    }
+    assert to_config(GOOD | changes).observed_size == observed
+
+
+@pytest.mark.parametrize(
+    ("size", "asked", "shift"), [(128, 0, 4), (64, 0, 2), (16, 0, 1), (128, 7, 7)]
+)
+def test_shifts_keep_their_share_of_the_image(size, asked, shift):
+    changes = {
+        "method": {"name": "drq", "shift": asked},
+        "env": {"task": "block_picking", "image_size": size},
+    }
+    assert to_config(GOOD | changes).shift == shift
+
+
 @pytest.mark.parametrize(("given", "kept"), [("d8", "D8"), ("so2", "SO2"), ("O2", "O2")])
 def test_group_is_normalised(given, kept):
     assert to_config(GOOD | {"group": given}).group == kept
@@ -54,9 +91,22 @@ def test_group_is_normalised(given, kept):
         ({"seed": -1}, "seed=-1: expected 0 or more"),
         ({"group": "SO3"}, "group=SO3: unknown symmetry group .*expected SO2, O2, or C<n> or D<n>"),
         ({"mode": "exact"}, "mode=exact: expected one of strict, paper"),
-        ({"method": {"name": "ferm"}}, "method=ferm: expected one of equivariant, cnn"),
-        ({"algorithm": {"name": "sacfd"}}, "algorithm=sacfd: expected one of sac"),
-        ({"augmentation": {"name": "online"}}, "augmentation=online"),
+        ({"method": {"name": "curl"}}, "method=curl: expected one of equivariant, .*rad, ferm"),
+        ({"algorithm": {"name": "td3"}}, "algorithm=td3: expected one of sac, sacfd"),
+        (
+            {"augmentation": {"name": "shift"}},
+            "augmentation=shift: expected one of buffer, online, auxiliary, none",
+        ),
+        ({"replay": {"sampling": "newest"}}, "replay.sampling=newest: expected one of auto, unif"),
+        ({"replay": {"beta": 1.5}}, "replay.beta=1.5: expected 0 to 1"),
+        (
+            {"replay": {"sampling": "symmetric"}, "demos": {"episodes": 0}},
+            "replay.sampling=symmetric: half of each batch .* above 0, got 0",
+        ),
+        (
+            {"demos": {"episodes": 0, "file": "a.hdf5"}},
+            "demos.file=a.hdf5: expected demos.episodes above 0, got 0",
+        ),
         ({"env": {"task": "block_stacking"}}, "env.task: unknown task .*block_picking"),
         ({"env": {"task": "block_picking", "image_size": 48}}, "image_size=48.*16, 32, 64"),
         ({"env": {"task": "block_picking", "robot": "ur5"}}, "robot=ur5: expected one of panda"),

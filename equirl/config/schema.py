@@ -53,13 +53,20 @@ class MethodConfig:
     name: str = one_of(MISSING, source=_METHODS)
     hidden: int = at_least(64, 1)  # width n of the encoder (appendix A); the CNN scales with it
     head_width: int = at_least(0, 0)  # fields of an equivariant critic head; 0: hidden (the paper)
+    # Of drq: shifted copies of a state, pixels of a shift.
+    target_views: int = at_least(2, 1)  # K, averaged in a target
+    loss_views: int = at_least(2, 1)  # M, averaged in the losses
+    shift: int = at_least(0, 0)  # to either side; 0: a 32nd of the image, 4 at 128 pixels
+    # Of ferm: contrastive learning of the encoder.
+    pretraining: int = at_least(1600, 0)  # steps on the demonstrations before training
+    momentum: float = within(0.05, 0, 1)  # share of the encoder that moves into its key copy
 
 
 @dataclass
 class AlgorithmConfig:
-    """Soft actor-critic (appendix D)."""
+    """Soft actor-critic (appendix D), with demonstrations in its losses or not (appendix G.2)."""
 
-    name: str = one_of(MISSING, "sac")
+    name: str = one_of(MISSING, "sac", "sacfd")
     learning_rate: float = within(1e-3, 0, 1)  # of Adam, for all parameters
     batch_size: int = at_least(64, 1)  # transitions an update
     discount: float = within(0.99, 0, 1)  # of the learner
@@ -67,14 +74,19 @@ class AlgorithmConfig:
     alpha: float = within(1e-2, 0, 1e6)  # initial temperature
     target_entropy: float = checked(-5.0, math.isfinite, "a finite number")
     averaging: float = checked(0.0, lambda x: 0 <= x < 1, "0 or more, below 1")  # see Learner
+    demonstration_weight: float = at_least(1.0, 0)  # of sacfd's term, the paper's 1/2 (a - a_e)^2
+    updates: int = at_least(1, 1)  # of the networks each environment step
+    critics: int = at_least(2, 1)  # heads; of more than two, targets take a random pair (REDQ)
 
 
 @dataclass
 class AugmentationConfig:
-    """Rotated copies of the replayed transitions (appendix F)."""
+    """What is made of the symmetry beside the networks (appendix F)."""
 
-    name: str = one_of(MISSING, "buffer", "none")
-    copies: int = at_least(4, 0)  # of each transition
+    name: str = one_of(MISSING, "buffer", "online", "auxiliary", "none")
+    copies: int = at_least(4, 0)  # of buffer: rotated copies of each stored transition
+    quarter_turns: bool = False  # turn by multiples of 90 degrees only, exact on pixels
+    weight: float = at_least(1.0, 0)  # of auxiliary: factor of the equivariance loss
 
 
 @dataclass
@@ -82,6 +94,7 @@ class DemosConfig:
     """Expert demonstrations stored before training."""
 
     episodes: int = at_least(20, 0)
+    file: str = ""  # a dataset they are read from, its first episodes; collected when empty
     options: dict[str, Any] = field(default_factory=dict)  # CHOICES of the task's expert
 
 
@@ -91,6 +104,15 @@ class ReplayConfig:
 
     capacity: int = at_least(100_000, 1)  # transitions, copies counted
     start: int = at_least(100, 1)  # transitions stored, copies counted, before updates begin
+    # How transitions are drawn: symmetric takes half of a batch from the demonstrations; auto is
+    # prioritized for sacfd, uniform for sac. All but uniform never overwrite demonstrations.
+    sampling: str = one_of("auto", "uniform", "prioritized", "symmetric")
+    # Of prioritized: (td error + bonus of an expert's + 1e-6)^exponent.
+    exponent: float = at_least(0.6, 0)
+    expert_bonus: float = at_least(1.0, 0)
+    beta: float = checked(0.4, lambda x: 0 <= x <= 1, "0 to 1")  # exponent of importance weights
+    beta_steps: int = at_least(10_000, 1)  # environment steps over which beta grows to 1
+    importance_weights: bool = True  # in the critic's loss; the paper's system leaves them out
 
 
 @dataclass
@@ -159,6 +181,27 @@ class Config:
         """Augmented copies of each stored transition."""
         return self.augmentation.copies if self.augmentation.name == "buffer" else 0
 
+    @property
+    def sampling(self) -> str:
+        """How transitions are drawn: ``"uniform"``, ``"prioritized"`` or ``"symmetric"``."""
+        if self.replay.sampling != "auto":
+            return self.replay.sampling
+        return "prioritized" if self.algorithm.name == "sacfd" else "uniform"
+
+    @property
+    def observed_size(self) -> int:
+        """Pixels a side of what the environment shows; methods that crop see less of it."""
+        from equirl.modules.layout import uncropped
+        from equirl.modules.methods import METHODS
+
+        size, method = self.env.image_size, METHODS.get(self.method.name)
+        return uncropped(size) if method and method.crops else size
+
+    @property
+    def shift(self) -> int:
+        """Pixels by which DrQ shifts images, to either side."""
+        return self.method.shift or max(1, round(self.env.image_size / 32))
+
     def validated(self) -> Config:
         """This configuration with the group's name in capitals, if its values fit together.
 
@@ -184,6 +227,18 @@ class Config:
             raise ConfigError(
                 f"replay.start={self.replay.start}: the buffer of {capacity} transitions never "
                 "holds so many"
+            )
+        demonstrations = self.demos.episodes
+        if self.sampling == "symmetric" and not demonstrations:
+            raise ConfigError(
+                "replay.sampling=symmetric: half of each batch is demonstrations, expected "
+                f"demos.episodes above 0, got {demonstrations}"
+            )
+        if self.sampling == "symmetric" and self.algorithm.batch_size < 2:
+            raise ConfigError("replay.sampling=symmetric: expected algorithm.batch_size above 1")
+        if self.demos.file and not demonstrations:
+            raise ConfigError(
+                f"demos.file={self.demos.file}: expected demos.episodes above 0, got 0"
             )
         return replace(self, group=group)
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictSequential
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -89,7 +89,7 @@ class DrQLoss(SACLoss):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The losses of a batch, see the class."""
-        views = self._shifted(torch.cat([tensordict] * self.loss_views))
+        views = self._shifted(TensorDict.cat([tensordict] * self.loss_views, 0))
         losses = super().forward(views)
         errors = views.get(self.tensor_keys.priority).reshape(self.loss_views, -1)
         tensordict.set(self.tensor_keys.priority, errors.mean(0))
@@ -98,7 +98,7 @@ class DrQLoss(SACLoss):
     def _compute_target_v2(self, tensordict: TensorDictBase) -> Tensor:
         """The targets of M copies of a batch, (M B,): those of a transition are the same."""
         transitions = tensordict[: len(tensordict) // self.loss_views].select("next")
-        views = torch.cat([transitions] * self.target_views)
+        views = TensorDict.cat([transitions] * self.target_views, 0)
         views["next"] = self._shifted(views["next"])
         target = super()._compute_target_v2(views).reshape(self.target_views, -1).mean(0)
         return target.repeat(self.loss_views)

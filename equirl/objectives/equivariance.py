@@ -82,7 +82,7 @@ class EquivarianceLoss(LossModule):
         keys = {*self.actor_network.in_keys, *self.critic_network.in_keys}
         seen = tensordict.select(*keys)
         turn = self._draw(len(seen))
-        both = torch.cat([seen, turn(seen)])
+        both = TensorDict.cat([seen, turn(seen)], 0)
         with shared_filters(apart=True):  # its graph must outlive that of other losses
             with self.actor_network_params.to_module(self.actor_network):
                 greedy = self.actor_network.get_dist(both.copy()).deterministic_sample

@@ -70,7 +70,7 @@ class SACfDLoss(SACLoss):
             raise ValueError(f"demonstration_weight={demonstration_weight!r}: expected 0 or more")
         super().__init__(actor, critic, **options)
         self.demonstration_weight = demonstration_weight
-        self.out_keys = [*self.out_keys, "loss_demonstration"]
+        self.out_keys: list[str] = [*self.out_keys, "loss_demonstration"]
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The actor's loss, and beside it ``loss_demonstration`` of the same actions."""

@@ -17,7 +17,7 @@ from equirl.config import is_free
 
 __all__ = ["CheckpointError", "check_same_config", "load_checkpoint", "save_checkpoint"]
 
-_FORMAT = 4
+_FORMAT = 5
 
 
 class CheckpointError(RuntimeError):

@@ -27,7 +27,7 @@ def make_run_env(config: Config) -> ManipulationEnv:
     options = find_task(config.env.task).paper_options if paper else {}
     return make_env(
         config.env.task,
-        image_size=config.env.image_size,
+        image_size=config.observed_size,
         robot=config.env.robot,
         max_steps=config.env.max_steps,
         time_limit="terminate" if paper else "truncate",

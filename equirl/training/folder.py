@@ -42,6 +42,7 @@ FILES = {
     "validation.csv": "success of the greedy policy on the validation scenes, while training",
     TEST: "a row a test scene, after training",
     "symmetry.csv": "errors under the group, on the pixel grid and between, while training",
+    "pretraining.csv": "contrastive loss and accuracy before training, of methods that have it",
     "timing.csv": "minutes so far, and milliseconds a call of each part of a step",
     CHECKPOINT: "networks, optimiser, replay buffer: all a resume needs",
     CURVES: "learning curves",

@@ -13,10 +13,13 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import SoftUpdate
 
 from equirl.config import Config, flatten
-from equirl.objectives import SACLoss
+from equirl.modules import METHODS
 from equirl.training.checkpoint import CheckpointError, check_same_config, load_checkpoint
 from equirl.training.folder import CHECKPOINT, load_run_config
+from equirl.training.losses import make_auxiliary_loss, make_loss
 from equirl.training.networks import make_networks
+from equirl.training.representation import RepresentationLearner
+from equirl.training.seeding import Purpose, torch_generator
 
 __all__ = ["Learner", "load_learner", "load_policy"]
 
@@ -24,11 +27,15 @@ __all__ = ["Learner", "load_learner", "load_policy"]
 class Learner:
     """Soft actor-critic as the paper trains it (appendix D).
 
-    One update computes the three losses from one set of parameters, takes one Adam step
+    One update computes the losses from one set of parameters, takes one Adam step
     on each, then moves the target critic. The actor's steps chase a moving critic, so it
     swings about the policy it is learning; on request an exponential moving average of
     its parameters (Polyak averaging) is kept as the policy to evaluate. Experience is
     always collected with the actor itself.
+
+    What a method or an augmentation adds to soft actor-critic is one of its parts: the kind of
+    ``loss``, an ``auxiliary`` loss on the same networks, or a ``representation`` that is learned
+    beside them.
 
     Args:
         config: The run's configuration.
@@ -40,14 +47,13 @@ class Learner:
 
     def __init__(self, config: Config):
         algorithm = config.algorithm
-        self.actor, self.critic = make_networks(config)
-        self.loss = SACLoss(
-            self.actor,
-            self.critic,
-            alpha_init=algorithm.alpha,
-            target_entropy=algorithm.target_entropy,
-            gamma=algorithm.discount,
-        ).to(config.torch_device)
+        self.generator = torch_generator(config.seed, Purpose.LOSSES)
+        self.actor, self.critic = networks = make_networks(config)
+        self.loss = make_loss(config, *networks, self.generator).to(config.torch_device)
+        self.auxiliary = make_auxiliary_loss(config, *networks, self.generator)
+        self.representation = None
+        if METHODS[config.method.name].contrastive:
+            self.representation = RepresentationLearner(config, *networks, self.generator)
         self.target_update = SoftUpdate(self.loss, tau=algorithm.tau)
         self.average = _average(self.actor, algorithm.averaging) if algorithm.averaging else None
         self.optimizer = torch.optim.Adam(
@@ -57,7 +63,10 @@ class Learner:
     @property
     def metric_names(self) -> tuple[str, ...]:
         """What `update` reports."""
-        return (*self.loss.out_keys, "td_error")
+        names = [*self.loss.out_keys, "td_error"]
+        names += self.auxiliary.out_keys if self.auxiliary else []
+        names += self.representation.metric_names if self.representation else []
+        return tuple(names)
 
     @property
     def policy(self) -> ProbabilisticActor:
@@ -76,19 +85,44 @@ class Learner:
         """
         self.optimizer.zero_grad(set_to_none=True)
         losses = self.loss.backward(batch)
+        metrics = {key: losses[key].item() for key in self.loss.out_keys}
+        metrics["td_error"] = batch["td_error"].mean().item()
+        if self.auxiliary:
+            terms = self.auxiliary(batch)
+            torch.stack(list(terms.values())).sum().backward()
+            metrics |= {key: value.item() for key, value in terms.items()}
         self.optimizer.step()
         self.target_update.step()
+        if self.representation:
+            metrics |= self.representation.update(batch)
         if self.average is not None:
             self.average.update_parameters(self.actor)
-        metrics = {key: losses[key].item() for key in self.loss.out_keys}
-        return metrics | {"td_error": batch["td_error"].mean().item()}
+        return metrics
+
+    def pretrain(self, batch: TensorDictBase) -> dict[str, float]:
+        """One step of the representation alone, before training; the target critic follows at once.
+
+        Args:
+            batch: Transitions of batch size (B,), of demonstrations.
+
+        Returns:
+            The representation's metrics.
+        """
+        assert self.representation is not None
+        metrics = self.representation.update(batch)
+        parameters = self.loss.qvalue_network_params.data
+        self.loss.target_qvalue_network_params.data.update_(parameters)
+        return metrics
 
     def state_dict(self) -> dict[str, Any]:
         """Networks, targets, temperature, optimiser and average."""
         state = {
             "loss": self.loss.state_dict(),
             "optimizer": self.optimizer.state_dict(),
+            "generator": self.generator.get_state(),
         }
+        if self.representation is not None:
+            state["representation"] = self.representation.state_dict()
         if self.average is not None:
             state["average"] = self.average.state_dict()
         return state
@@ -97,6 +131,9 @@ class Learner:
         """Restores what `state_dict` returned."""
         self.loss.load_state_dict(state["loss"])
         self.optimizer.load_state_dict(state["optimizer"])
+        self.generator.set_state(state["generator"])
+        if self.representation is not None:
+            self.representation.load_state_dict(state["representation"])
         if self.average is not None:
             self.average.load_state_dict(state["average"])
 

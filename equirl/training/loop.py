@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 
 from equirl.collectors import DemonstrationCollector, Episode, OnlineCollector
 from equirl.config import Config, ConfigError, flatten
-from equirl.data import load_replay_state, make_replay_buffer, replay_state
+from equirl.data import load_replay_state, protect_demonstrations, replay_state
 from equirl.modules import shared_filters
 from equirl.training.checkpoint import (
     CheckpointError,
@@ -22,6 +23,7 @@ from equirl.training.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
+from equirl.training.demonstrations import store_demonstrations
 from equirl.training.environment import make_run_env, make_run_expert
 from equirl.training.equivariance import replay_observations, symmetry_errors
 from equirl.training.evaluation import Evaluation, evaluate
@@ -29,6 +31,7 @@ from equirl.training.folder import CHECKPOINT
 from equirl.training.learner import Learner
 from equirl.training.metrics import Averages, MetricsLog
 from equirl.training.progress import Progress
+from equirl.training.replay import make_priorities, make_run_buffer
 from equirl.training.seeding import Purpose, scene_seed, seed_everything, torch_generator
 from equirl.training.timing import Stopwatch
 
@@ -40,8 +43,14 @@ _log = logging.getLogger("equirl")
 #: stay the same until the buffer is full.
 _OBSERVATIONS, _FIRST = 16, 64
 
+#: Pre-training steps between two rows of their table.
+_PRETRAINING_ROWS = 100
+
 #: What the run's time is divided into.
-PARTS = ("demonstrations", "act", "environment", "replay", "update", "evaluation", "checkpoint")
+PARTS = (
+    *("demonstrations", "pretraining", "act", "environment"),
+    *("replay", "update", "evaluation", "checkpoint"),
+)
 
 
 class TrainingRun:
@@ -75,14 +84,8 @@ class TrainingRun:
         self.evaluation_env = make_run_env(config)
         self.max_depth = self.env.observation_spec["depth"].high.max().item()
         self.generator = torch_generator(config.seed, Purpose.REPLAY)
-        self.buffer = make_replay_buffer(
-            config.replay.capacity,
-            copies=config.copies,
-            batch_size=config.algorithm.batch_size,
-            max_depth=self.max_depth,
-            device=config.torch_device,
-            generator=self.generator,
-        )
+        self.buffer = make_run_buffer(config, self.max_depth, self.generator)
+        self.priorities = make_priorities(config)
         self.collector = OnlineCollector(
             self.env,
             self.learner.actor,
@@ -93,6 +96,7 @@ class TrainingRun:
         self.log = MetricsLog(folder, config)
         self.clock = Stopwatch(PARTS)
         self.step = 0
+        self.demonstrated = False  # whether the buffer has all demonstrations
         self.averages = Averages(self.learner.metric_names)
         self.progress = Progress(config.logging.progress)
 
@@ -112,7 +116,8 @@ class TrainingRun:
             except KeyError as error:
                 raise CheckpointError(f"{path} lacks {error}") from error
             _log.info("goes on after step %d", self.step)
-        self.log.rewind(self.step)
+        representation = self.learner.representation
+        self.log.rewind(self.step, pretraining=representation.steps if representation else 0)
 
     def run(self) -> Evaluation | None:
         """Trains to the configured number of steps, then evaluates on the test scenes.
@@ -120,9 +125,7 @@ class TrainingRun:
         Returns:
             The evaluation, or None when ``should_stop`` ended the run early.
         """
-        if self.step == 0 and not self._collect_demonstrations():
-            return None
-        if not self._train():
+        if not (self._collect_demonstrations() and self._pretrain() and self._train()):
             return None
         episodes = self.config.evaluation.final_episodes
         with self.clock.measure("evaluation"):
@@ -137,20 +140,51 @@ class TrainingRun:
                 env.close()
 
     def _collect_demonstrations(self) -> bool:
-        """Fills the buffer; False when it was told to stop."""
-        if self.config.demos.episodes == 0:
+        """Fills the buffer, unless that was done; False when it was told to stop."""
+        if self.demonstrated:
             return True
-        demonstrations = DemonstrationCollector(
+        with self.clock.measure("demonstrations"):
+            for _ in self._demonstrations():
+                if self.should_stop():
+                    return False
+        if self.config.sampling != "uniform" and len(self.buffer):
+            protect_demonstrations(self.buffer)
+        self.demonstrated = True
+        return True
+
+    def _demonstrations(self) -> Iterable[TensorDictBase]:
+        """Stores one demonstration after the other: from a file, or of the expert."""
+        demos = self.config.demos
+        if demos.file:
+            return store_demonstrations(self.config, self.env, self.buffer)
+        if not demos.episodes:
+            return ()
+        return DemonstrationCollector(
             self.env,
             make_run_expert(self.config, self.env),
-            episodes=self.config.demos.episodes,
+            episodes=demos.episodes,
             seeds=partial(scene_seed, self.config.seed, Purpose.DEMONSTRATIONS),
             replay_buffer=self.buffer,
         )
-        with self.clock.measure("demonstrations"):
-            for _ in demonstrations:
-                if self.should_stop():
+
+    def _pretrain(self) -> bool:
+        """Trains FERM's representation on the demonstrations; False when it was told to stop."""
+        representation, total = self.learner.representation, self.config.method.pretraining
+        if representation is None or self.step or not len(self.buffer):
+            return True
+        done = representation.steps
+        with self.progress.bar(total=total, initial=done, desc="pretraining", unit="step") as bar:
+            while representation.steps < total:
+                with self.clock.measure("pretraining"):
+                    metrics = self.learner.pretrain(self.buffer.sample())
+                done, stop = representation.steps, self.should_stop()
+                if done % _PRETRAINING_ROWS == 0 or done == total:
+                    self.log.write("pretraining", {"step": done, **metrics})
+                if stop or done % self.config.checkpoint_every == 0:
+                    self._save()
+                if stop:
                     return False
+                bar.update(1)
         return True
 
     def _train(self) -> bool:
@@ -182,11 +216,21 @@ class TrainingRun:
         with self.clock.measure("replay"):
             self.buffer.extend(transition)
         if len(self.buffer) * (self.config.copies + 1) >= self.config.replay.start:
-            with self.clock.measure("replay"):
-                batch = self.buffer.sample()
-            with self.clock.measure("update"):
-                self.averages.add(self.learner.update(batch))
+            for _ in range(self.config.algorithm.updates):
+                self._update()
         return episode
+
+    def _update(self) -> None:
+        """One update on a batch of the buffer."""
+        with self.clock.measure("replay"):
+            if self.priorities:
+                self.priorities.anneal(self.buffer, self.step)
+            batch = self.buffer.sample()
+        with self.clock.measure("update"):
+            self.averages.add(self.learner.update(batch))
+        if self.priorities:
+            with self.clock.measure("replay"):
+                self.priorities.update(self.buffer, batch)
 
     def _log_episode(self, episode: Episode) -> None:
         self.progress.note(episode)
@@ -252,6 +296,7 @@ class TrainingRun:
             {
                 "config": flatten(self.config),
                 "step": self.step,
+                "demonstrated": self.demonstrated,
                 "learner": self.learner.state_dict(),
                 "buffer": replay_state(self.buffer),
                 "collector": self.collector.state_dict(),
@@ -270,7 +315,7 @@ class TrainingRun:
             raise CheckpointError(
                 f"{path} is at step {state['step']}, beyond steps={self.config.steps}"
             )
-        self.step = state["step"]
+        self.step, self.demonstrated = state["step"], state["demonstrated"]
         self.learner.load_state_dict(state["learner"])
         load_replay_state(self.buffer, state["buffer"])
         self.collector.load_state_dict(state["collector"])

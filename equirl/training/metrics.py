@@ -27,14 +27,18 @@ class MetricsLog:
         config: Says which trackers are wanted, and is shown there.
     """
 
-    TABLES = ("metrics", "validation", "symmetry", "timing")
+    TABLES = ("metrics", "validation", "symmetry", "timing", "pretraining")
 
     def __init__(self, folder: Path, config: Config):
         self.folder = folder
         self.trackers = _trackers(folder, config)
 
-    def rewind(self, step: int) -> None:
+    def rewind(self, step: int, pretraining: int = 0) -> None:
         """Drops the rows after ``step``, which a resumed run will write again.
+
+        Args:
+            step: Training steps done.
+            pretraining: The same for the table of pre-training, which has steps of its own.
 
         Raises:
             TableError: A table is damaged; it is left as it is.
@@ -45,7 +49,8 @@ class MetricsLog:
                 continue
             steps = read_table(path, ["step"]).get("step", [])  # a damaged table is refused here
             lines = [line for line in path.read_text().splitlines(True) if line.endswith("\n")]
-            kept = [line for line, at in zip(lines[1:], steps, strict=False) if at <= step]
+            last = pretraining if table == "pretraining" else step
+            kept = [line for line, at in zip(lines[1:], steps, strict=False) if at <= last]
             write_atomically(path, "".join(lines[:1] + kept))
 
     def write(self, table: str, row: Row) -> None:

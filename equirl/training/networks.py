@@ -27,10 +27,10 @@ def make_networks(config: Config) -> tuple[ProbabilisticActor, nn.Module]:
         "generator": torch_generator(config.seed, Purpose.NETWORKS),
         "device": config.torch_device,
     }
-    heads: dict[str, Any] = {}
+    heads: dict[str, Any] = {"heads": config.algorithm.critics}
     if method.equivariant:
         size |= {"group": config.group, "mode": config.mode, "backend": config.backend}
-        heads = {"head_width": config.method.head_width or None}
+        heads |= {"head_width": config.method.head_width or None}
     try:
         return method.make_actor(**size), method.make_critic(**size, **heads)
     except (ValueError, NativeUnavailable) as error:
@@ -39,6 +39,8 @@ def make_networks(config: Config) -> tuple[ProbabilisticActor, nn.Module]:
 
 def describe_method(config: Config) -> str:
     """What is trained, for titles."""
+    algorithm = {"sac": "SAC", "sacfd": "SACfD"}[config.algorithm.name]
     if METHODS[config.method.name].equivariant:
-        return f"{config.group}-equivariant SAC ({config.mode} mode)"
-    return f"{config.method.name.upper()} SAC"
+        return f"{config.group}-equivariant {algorithm} ({config.mode} mode)"
+    name = {"drq": "DrQ"}.get(config.method.name, config.method.name.upper())
+    return f"{name} {algorithm}"

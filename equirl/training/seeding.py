@@ -22,6 +22,7 @@ class Purpose(IntEnum):
     TRAINING = 5
     VALIDATION = 6
     TEST = 7
+    LOSSES = 8
 
 
 def scene_seed(run_seed: int, purpose: Purpose, index: int = 0) -> int:
@@ -36,7 +37,7 @@ def scene_seed(run_seed: int, purpose: Purpose, index: int = 0) -> int:
         index: Number of the episode, 0 or more.
 
     Returns:
-        An integer below 2**59, a function of the arguments alone.
+        An integer below 2**60, a function of the arguments alone.
     """
     digest = hashlib.blake2b(f"{run_seed}/{int(purpose)}/{index}".encode(), digest_size=8)
     noise = int.from_bytes(digest.digest(), "little") % 2**_PURPOSE_SHIFT

@@ -34,7 +34,7 @@ def test_seeds_of_different_purposes_never_meet():
     ]
     assert len(set(seeds)) == len(seeds)
     assert len({seed >> 56 for seed in seeds}) == len(Purpose)  # disjoint by construction
-    assert max(seeds) < 2**59 and scene_seed(1, Purpose.TEST, 5) == scene_seed(1, Purpose.TEST, 5)
+    assert max(seeds) < 2**60 and scene_seed(1, Purpose.TEST, 5) == scene_seed(1, Purpose.TEST, 5)
 
 
 def test_evaluation_of_the_expert_and_of_idling(env):

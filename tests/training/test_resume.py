@@ -1,49 +1,13 @@
 """A run stopped and resumed is the run never stopped, bit for bit."""
 
 import shutil
-from contextlib import closing
 
 import pytest
 import torch
 
-from equirl.training import CHECKPOINT, CheckpointError, TrainingRun, load_checkpoint
+from equirl.training import CHECKPOINT, CheckpointError, load_checkpoint
 from equirl.training.checkpoint import save_checkpoint
-
-
-def run(config, folder, stop_after=None) -> TrainingRun:
-    folder.mkdir(exist_ok=True)
-    with closing(TrainingRun(config, folder)) as training:
-        if stop_after is not None:
-            training.should_stop = lambda: training.step >= stop_after
-        training.restore()
-        training.run()
-    return training
-
-
-def assert_same(first, second, where=""):
-    assert type(first) is type(second), where
-    if isinstance(first, torch.Tensor):
-        assert torch.equal(first, second), where
-    elif isinstance(first, dict):
-        assert first.keys() == second.keys(), where
-        for key in first:
-            assert_same(first[key], second[key], f"{where}/{key}")
-    elif isinstance(first, list | tuple):
-        assert len(first) == len(second), where
-        for index, pair in enumerate(zip(first, second, strict=True)):
-            assert_same(*pair, f"{where}/{index}")
-    else:
-        assert first == second, where
-
-
-def assert_same_run(first, second):
-    states = [load_checkpoint(folder / CHECKPOINT) for folder in (first, second)]
-    for state in states:
-        del state["clock"]
-        state["config"].pop("steps")
-    assert_same(*states)
-    for table in ("metrics.csv", "validation.csv"):
-        assert (first / table).read_bytes() == (second / table).read_bytes(), table
+from tests.training.runs import assert_same_run, run
 
 
 @pytest.mark.parametrize(

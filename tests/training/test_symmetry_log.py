@@ -13,7 +13,7 @@ from equirl.modules import make_actor
 from equirl.symmetry import random_observations
 from equirl.training import CHECKPOINT, load_checkpoint, replay_observations
 from equirl.training.equivariance import symmetry_errors
-from tests.training.test_resume import assert_same, run
+from tests.training.runs import assert_same, run
 from tests.transitions import transitions
 
 MEASURED = {"evaluation": {"equivariance": True}}

@@ -36,7 +36,7 @@ _MOST_BETWEEN = 8
 def image_of(config: Config) -> HeightmapSpec:
     """What the depth image of a run shows."""
     view = make_task(config.env.task, **config.env.options).view
-    return HeightmapSpec(config.env.image_size, view)
+    return HeightmapSpec(config.observed_size, view)
 
 
 def describe_policy(config: Config, actor: ProbabilisticActor, steps: int) -> dict[str, Any]:

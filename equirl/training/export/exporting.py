@@ -147,10 +147,10 @@ def check_exported(
     image, stored = about["image"], None
     if folder is not None:
         config, state, learner = load_learner(folder, "cpu", "auto")
-        if config.env.image_size != image["pixels"]:
+        if config.observed_size != image["pixels"]:
             raise ExportError(
                 f"{path} takes images of {image['pixels']} pixels a side, the policy of {folder} "
-                f"images of {config.env.image_size}"
+                f"images of {config.observed_size}"
             )
         stored = _stored(config, state, observations // 2)
     seen = make_observations(observations, image["pixels"], image["max_depth_m"], stored)
