@@ -99,6 +99,23 @@ def test_group_is_normalised(given, kept):
         ),
         ({"replay": {"sampling": "newest"}}, "replay.sampling=newest: expected one of auto, unif"),
         ({"replay": {"beta": 1.5}}, "replay.beta=1.5: expected 0 to 1"),
+        ({"replay": {"exponent": 8.0}}, "replay.exponent=8.0: expected 0 to 1"),
+        (
+            {"method": {"name": "drq", "shift": 64}},
+            "method.shift=64: expected less than half of env.image_size=128",
+        ),
+        (
+            {"method": {"name": "ferm"}, "algorithm": {"name": "sac", "batch_size": 1}},
+            "algorithm.batch_size=1: method=ferm tells .* expected 2 or more",
+        ),
+        (
+            {"method": {"name": "rad"}, "env": {"task": "block_picking", "image_size": 142}},
+            "image_size=142 is not .* the side of the crop: the environment shows more by itself",
+        ),
+        (
+            {"demos": {"file": "a.hdf5", "options": {"grasp": "aligned"}}},
+            "demos.options=.*: expected none, the demonstrations of demos.file=a.hdf5 are",
+        ),
         (
             {"replay": {"sampling": "symmetric"}, "demos": {"episodes": 0}},
             "replay.sampling=symmetric: half of each batch .* above 0, got 0",

@@ -123,10 +123,11 @@ def load_config(path: Path) -> Config:
 
 
 def _shortened(name: str, longest: int = 200) -> str:
-    """A name that serves for a folder: what is too long ends in a digest of it."""
-    if len(name) <= longest:
+    """A name that serves for one folder: what is too long, or is a path, ends in a digest of it."""
+    plain = name.replace("/", "-").lstrip(".")
+    if plain == name and len(name) <= longest:
         return name
-    return f"{name[: longest - 9]}_{hashlib.blake2b(name.encode(), digest_size=4).hexdigest()}"
+    return f"{plain[: longest - 9]}_{hashlib.blake2b(name.encode(), digest_size=4).hexdigest()}"
 
 
 def register() -> None:

@@ -12,6 +12,7 @@ from equirl.config.declare import ConfigError, at_least, checked, keys_of, one_o
 
 if TYPE_CHECKING:
     from equirl.envs.tasks import Task
+    from equirl.modules.methods import Method
 
 __all__ = [
     "BACKENDS_SOURCE",
@@ -108,11 +109,12 @@ class ReplayConfig:
     # prioritized for sacfd, uniform for sac. All but uniform never overwrite demonstrations.
     sampling: str = one_of("auto", "uniform", "prioritized", "symmetric")
     # Of prioritized: (td error + bonus of an expert's + 1e-6)^exponent.
-    exponent: float = at_least(0.6, 0)
+    exponent: float = checked(0.6, lambda x: 0 <= x <= 1, "0 to 1")
     expert_bonus: float = at_least(1.0, 0)
     beta: float = checked(0.4, lambda x: 0 <= x <= 1, "0 to 1")  # exponent of importance weights
-    beta_steps: int = at_least(10_000, 1)  # environment steps over which beta grows to 1
-    importance_weights: bool = True  # in the critic's loss; the paper's system leaves them out
+    beta_steps: int = at_least(10_000, 1)  # environment steps, of the run, while beta grows to 1
+    # Whether importance weights enter the critic's loss; auto drops them in mode=paper.
+    importance_weights: str = one_of("auto", "apply", "drop")
 
 
 @dataclass
@@ -152,7 +154,7 @@ class Config:
     logging: LoggingConfig = keys_of(LoggingConfig, free=True)
     mode: str = one_of("strict", source=_MODES)  # the mathematics, independent of sizes
     group: str = "D4"  # C<n> or D<n>, n from 2 to 1000, SO2 or O2
-    steps: int = at_least(10_000, 1, free=True)  # environment steps, one update each
+    steps: int = at_least(10_000, 1, free=True)  # environment steps
     checkpoint_every: int = at_least(500, 1, free=True)  # steps
     seed: int = at_least(0, 0)  # of networks, scenes, actions and replay
     device: str = field(default="auto", metadata={"free": True})  # "auto", "cpu" or "cuda:<i>"
@@ -189,13 +191,29 @@ class Config:
         return "prioritized" if self.algorithm.name == "sacfd" else "uniform"
 
     @property
+    def importance_weights(self) -> bool:
+        """Whether importance weights enter the critic's loss."""
+        asked = self.replay.importance_weights
+        return asked == "apply" or (asked == "auto" and self.mode == "strict")
+
+    @property
     def observed_size(self) -> int:
         """Pixels a side of what the environment shows; methods that crop see less of it."""
         from equirl.modules.layout import uncropped
+
+        size = self.env.image_size
+        return uncropped(size) if self._crops else size
+
+    @property
+    def _crops(self) -> bool:
+        return self._method is not None and self._method.crops
+
+    @property
+    def _method(self) -> Method | None:
+        """What makes up the method; None if there is no such one."""
         from equirl.modules.methods import METHODS
 
-        size, method = self.env.image_size, METHODS.get(self.method.name)
-        return uncropped(size) if method and method.crops else size
+        return METHODS.get(self.method.name)
 
     @property
     def shift(self) -> int:
@@ -219,7 +237,13 @@ class Config:
         try:
             check_sizes(self.method.hidden, self.env.image_size)
         except ValueError as error:
-            raise ConfigError(f"method.hidden or env.image_size: {error}") from None
+            crops = (
+                f". With method={self.method.name} env.image_size is the side of the crop: the "
+                "environment shows more by itself, 142 pixels for 128"
+            )
+            more = crops if self._crops else ""
+            raise ConfigError(f"method.hidden or env.image_size: {error}{more}") from None
+        self._check_method()
         capacity, versions = self.replay.capacity, self.copies + 1
         if capacity < versions:
             raise ConfigError(f"replay.capacity={capacity}: expected {versions} or more")
@@ -228,6 +252,25 @@ class Config:
                 f"replay.start={self.replay.start}: the buffer of {capacity} transitions never "
                 "holds so many"
             )
+        self._check_demonstrations()
+        return replace(self, group=group)
+
+    def _check_method(self) -> None:
+        """Checks numbers of a method against those of others."""
+        method, batch = self._method, self.algorithm.batch_size
+        if method and method.shifts and 2 * self.shift >= self.env.image_size:
+            raise ConfigError(
+                f"method.shift={self.shift}: expected less than half of "
+                f"env.image_size={self.env.image_size}"
+            )
+        if method and method.contrastive and batch < 2:
+            raise ConfigError(
+                f"algorithm.batch_size={batch}: method={self.method.name} tells the observations "
+                "of a batch apart, expected 2 or more"
+            )
+
+    def _check_demonstrations(self) -> None:
+        """Checks that what needs demonstrations has them, and has them from one place."""
         demonstrations = self.demos.episodes
         if self.sampling == "symmetric" and not demonstrations:
             raise ConfigError(
@@ -240,7 +283,11 @@ class Config:
             raise ConfigError(
                 f"demos.file={self.demos.file}: expected demos.episodes above 0, got 0"
             )
-        return replace(self, group=group)
+        if self.demos.file and self.demos.options:
+            raise ConfigError(
+                f"demos.options={self.demos.options}: expected none, the demonstrations of "
+                f"demos.file={self.demos.file} are what they are"
+            )
 
 
 def make_run_task(env: EnvConfig) -> Task:
@@ -265,10 +312,12 @@ def make_run_task(env: EnvConfig) -> Task:
 
 def _check_expert(env: EnvConfig, demos: DemosConfig) -> None:
     task = make_run_task(env)
-    if not demos.episodes:
+    if not demos.episodes or demos.file:
         return
     if task.expert is None:
-        raise ConfigError(f"demos.episodes={demos.episodes}: {env.task} has no expert; expected 0")
+        raise ConfigError(
+            f"demos.episodes={demos.episodes}: {env.task} has no expert; expected 0, or demos.file"
+        )
     try:
         task.expert.resolve(demos.options)
     except ValueError as error:

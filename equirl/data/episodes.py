@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 
 from equirl.data.keys import TRANSITION_KEYS
 
-__all__ = ["DatasetError", "check_episode", "check_image_size", "project_onto_disc"]
+__all__ = [
+    "DatasetError",
+    "check_environment",
+    "check_episode",
+    "check_image_size",
+    "project_onto_disc",
+]
 
 #: What a number may be, by the last part of its key.
 _RANGES = {
@@ -81,6 +89,30 @@ def check_image_size(episode: TensorDictBase, size: int | None, name: str) -> in
         if found != expected:
             raise DatasetError(f"{name} has images of {found} pixels a side, expected {expected}")
     return expected
+
+
+def check_environment(stated: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    """Checks what a file says about where it was recorded.
+
+    Args:
+        stated: What it says; of what it leaves out nothing is asked.
+        wanted: What is expected.
+
+    Raises:
+        DatasetError: They differ; the message names the first difference.
+    """
+    there, here = _flat(stated), _flat(json.loads(json.dumps(dict(wanted), default=str)))
+    for key, value in here.items():
+        if key in there and there[key] != value:
+            raise DatasetError(f"recorded with {key}={there[key]!r}, expected {value!r}")
+
+
+def _flat(values: Mapping[str, Any]) -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        inner = value if isinstance(value, dict) else {}
+        flat |= {f"{key}.{name}": each for name, each in inner.items()} or {key: value}
+    return flat
 
 
 def project_onto_disc(episodes: Sequence[TensorDictBase]) -> tuple[list[TensorDictBase], int]:

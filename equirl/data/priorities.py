@@ -79,9 +79,9 @@ class Priorities:
 
     def __post_init__(self) -> None:
         for name, valid, expected in (
-            ("exponent", 0 <= self.exponent < math.inf, "a number of 0 or more"),
+            ("exponent", 0 <= self.exponent <= 1, "a number from 0 to 1"),
             ("bonus", 0 <= self.bonus < math.inf, "a number of 0 or more"),
-            ("epsilon", 0 < self.epsilon < math.inf, "a number above 0"),
+            ("epsilon", 1e-30 < self.epsilon < math.inf, "a number above 1e-30"),
             ("beta", 0 <= self.beta <= 1, "a number from 0 to 1"),
             ("steps", isinstance(self.steps, int) and self.steps >= 1, "an integer of 1 or more"),
         ):

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from equirl.data.episodes import DatasetError, check_episode, check_image_size
+from equirl.data.episodes import DatasetError, check_environment, check_episode, check_image_size
 from equirl.data.keys import TRANSITION_KEYS
 
 __all__ = ["read_demonstrations", "read_environment", "write_demonstrations"]
@@ -113,7 +113,7 @@ def read_demonstrations(
     failures = 0
     with _opened(Path(path)) as file:
         data = _group(file, "data")
-        _compare(_environment(data), wanted)
+        check_environment(_environment(data), wanted)
         for name in _names(file, data, filter):
             if len(found) == episodes:
                 break
@@ -222,13 +222,6 @@ def _environment(data: h5py.Group) -> dict[str, Any]:
         return {}  # words of others mean other things
     stated = {"task": known["env_name"], **known["env_kwargs"]}
     return {key: value for key, value in stated.items() if value is not None}
-
-
-def _compare(stated: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
-    for key, value in wanted.items():
-        value = json.loads(json.dumps(value, default=str))  # as it comes back from a file
-        if key in stated and stated[key] != value:
-            raise DatasetError(f"recorded with {key}={stated[key]!r}, expected {value!r}")
 
 
 def _names(file: h5py.File, data: h5py.Group, filter: str) -> list[str]:

@@ -63,16 +63,17 @@ class QuantizeDepth(Transform):
 
 
 class RandomCrop(Transform):
-    """A random window of the images of each sampled transition (paper, appendix G.3: RAD, FERM).
+    """A random window of the images of each sampled transition (RAD, FERM; paper, appendix H).
 
     Observation and next observation of a transition are cropped by the same window, all its
     positions equally likely. Nothing is done at insertion: whole images are stored.
 
     Args:
         size: Rows and columns of the window, in pixels.
-        positives: Also write ``"positive"``, a second window of the observation's ``depth``
-            drawn independently of the first: what the contrastive loss of FERM is to
+        positives: Also write ``"positive"``, a second window of the first of the observation's
+            images, drawn independently of the first: what the contrastive loss of FERM is to
             recognise.
+        in_keys: The images, each also looked up under ``"next"``.
         generator: Source of the windows, a CPU generator.
 
     Raises:
@@ -87,11 +88,12 @@ class RandomCrop(Transform):
         size: int,
         *,
         positives: bool = False,
+        in_keys: Sequence[str] = ("depth",),
         generator: torch.Generator | None = None,
     ):
         if not isinstance(size, int) or size < 1:
             raise ValueError(f"size={size!r}: expected an integer of 1 or more")
-        keys = _with_next(["depth"])
+        keys = _with_next(in_keys)
         super().__init__(in_keys=keys, out_keys=[*keys, self.POSITIVE] if positives else keys)
         self.size = size
         self.positives = positives
@@ -99,12 +101,12 @@ class RandomCrop(Transform):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Crops the images of a sampled batch (B,), each (B, C, H, W), to (B, C, size, size)."""
-        depth = tensordict.get("depth")
-        window = self._draw(depth)
+        image = tensordict.get(self.in_keys[0])
+        window = self._draw(image)
         for key in self.in_keys:
             tensordict.set(key, self._crop(tensordict.get(key), window))
         if self.positives:
-            tensordict.set(self.POSITIVE, self._crop(depth, self._draw(depth)))
+            tensordict.set(self.POSITIVE, self._crop(image, self._draw(image)))
         return tensordict
 
     def _draw(self, image: Tensor) -> tuple[Tensor, Tensor]:

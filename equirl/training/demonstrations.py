@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from dataclasses import fields
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,6 @@ from equirl.config import Config
 from equirl.data.episodes import project_onto_disc
 from equirl.data.robomimic import read_demonstrations, write_demonstrations
 from equirl.envs import ManipulationEnv
-from equirl.envs.tasks import find_task
 from equirl.envs.workspace import WORKSPACE
 from equirl.training.environment import make_run_env, make_run_expert
 from equirl.training.seeding import Purpose, scene_seed
@@ -44,7 +44,6 @@ def describe_environment(config: Config, env: ManipulationEnv) -> dict[str, Any]
         config: Of the run.
         env: What `make_run_env` made of it.
     """
-    options = find_task(config.env.task).paper_options if config.mode == "paper" else {}
     return {
         "task": config.env.task,
         "image_size": env.observation_spec["depth"].shape[-1],
@@ -52,7 +51,7 @@ def describe_environment(config: Config, env: ManipulationEnv) -> dict[str, Any]
         "robot": env.robot,
         "max_steps": env.max_steps,
         "time_limit": env.time_limit,
-        "options": {**options, **config.env.options},
+        "options": {each.name: getattr(env.task, each.name) for each in fields(env.task)},
     }
 
 
@@ -104,8 +103,8 @@ def store_demonstrations(
 ) -> Iterator[TensorDictBase]:
     """Writes the first demonstrations of a run's file into its buffer, yielding each.
 
-    In ``strict`` mode actions that no policy can imitate are projected onto the disc first, and
-    how many is said once.
+    In ``strict`` mode actions that no equivariant policy can imitate are projected onto the disc
+    first, whatever the method, so that all have the same demonstrations; how many is said once.
 
     Args:
         config: Of the run, with ``demos.file`` and ``demos.episodes``.
@@ -127,8 +126,8 @@ def store_demonstrations(
         episodes, outside = project_onto_disc(episodes)
         if outside:
             _log.info(
-                "%d of %d demonstrated actions had (x, y) outside the unit disc, where policies of "
-                "mode=strict act, and were projected onto it",
+                "%d of %d demonstrated actions had (x, y) outside the unit disc, where the "
+                "equivariant policies of mode=strict act, and were projected onto it",
                 outside,
                 sum(map(len, episodes)),
             )

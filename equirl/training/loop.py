@@ -1,4 +1,4 @@
-"""The training run: demonstrations, then one update an environment step."""
+"""The training run: demonstrations, then environment steps and updates in turn."""
 
 from __future__ import annotations
 
@@ -147,10 +147,22 @@ class TrainingRun:
             for _ in self._demonstrations():
                 if self.should_stop():
                     return False
+                self._check_room()
         if self.config.sampling != "uniform" and len(self.buffer):
             protect_demonstrations(self.buffer)
+        if self.config.algorithm.name == "sacfd" and not len(self.buffer):
+            _log.info("algorithm=sacfd without demonstrations: its term is zero")
         self.demonstrated = True
         return True
+
+    def _check_room(self) -> None:
+        """Refuses demonstrations that fill a buffer in which they are to stay."""
+        if self.config.sampling != "uniform" and len(self.buffer) == self.buffer.storage.max_size:
+            raise ConfigError(
+                f"replay.capacity={self.config.replay.capacity}: no room is left beside the "
+                f"demonstrations, {self.config.copies} copies of each transition counted; expected "
+                "more, or less of demos.episodes or augmentation.copies"
+            )
 
     def _demonstrations(self) -> Iterable[TensorDictBase]:
         """Stores one demonstration after the other: from a file, or of the expert."""
@@ -208,7 +220,7 @@ class TrainingRun:
         return True
 
     def _step(self) -> Episode | None:
-        """One environment step and one update; the episode's summary if it ended."""
+        """One environment step and its updates; the episode's summary if it ended."""
         with self.clock.measure("act"):
             action = self.collector.act()
         with self.clock.measure("environment"):
@@ -216,8 +228,10 @@ class TrainingRun:
         with self.clock.measure("replay"):
             self.buffer.extend(transition)
         if len(self.buffer) * (self.config.copies + 1) >= self.config.replay.start:
-            for _ in range(self.config.algorithm.updates):
-                self._update()
+            for number in range(self.config.algorithm.updates):
+                # Only the first can use what the actor expanded: the graph of it is gone then.
+                with shared_filters(apart=number > 0):
+                    self._update()
         return episode
 
     def _update(self) -> None:

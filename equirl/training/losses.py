@@ -34,7 +34,7 @@ def make_loss(
         "alpha_init": algorithm.alpha,
         "target_entropy": algorithm.target_entropy,
         "gamma": algorithm.discount,
-        "importance_weights": config.replay.importance_weights,
+        "importance_weights": config.importance_weights,
         "generator": generator,
     }
     demonstrated, shifts = algorithm.name == "sacfd", METHODS[method.name].shifts

@@ -74,3 +74,12 @@ def test_bad_windows_are_named():
         RandomCrop(0)
     with pytest.raises(ValueError, match=r"16 x 16 pixels cannot be cropped to 18 x 18"):
         RandomCrop(18)(transitions(2))
+
+
+def test_images_under_other_names_are_cropped_too():
+    data = numbered(5, 10, 10)
+    renamed = TensorDict({"pixels": data["depth"], "next": {"pixels": data["next", "depth"]}}, [5])
+    seed = torch.Generator().manual_seed(0)
+    batch = RandomCrop(8, in_keys=["pixels"], positives=True, generator=seed)(renamed)
+    assert torch.equal(batch["next", "pixels"], batch["pixels"] + 0.5)
+    assert batch["positive"].shape == batch["pixels"].shape == (5, 1, 8, 8)

@@ -153,9 +153,9 @@ def test_demonstrations_stay_under_priorities():
 
 def test_bad_numbers_are_named():
     for arguments, message in (
-        ({"exponent": -0.1}, "exponent=-0.1: expected a number of 0 or more"),
+        ({"exponent": -0.1}, "exponent=-0.1: expected a number from 0 to 1"),
         ({"bonus": float("nan")}, "bonus=nan: expected"),
-        ({"epsilon": 0.0}, "epsilon=0.0: expected a number above 0"),
+        ({"epsilon": 0.0}, "epsilon=0.0: expected a number above 1e-30"),
         ({"beta": 1.5}, "beta=1.5: expected a number from 0 to 1"),
         ({"steps": 0}, "steps=0: expected an integer of 1 or more"),
         ({"steps": 0.5}, "steps=0.5: expected an integer"),

@@ -246,7 +246,7 @@ def test_what_is_wrong_with_an_episode_is_named(ours, change, message):
     [
         ({"task": "block_pushing"}, "task='block_picking', expected 'block_pushing'"),
         ({"view": 0.45}, "recorded with view=0.3, expected 0.45"),
-        ({"options": {}}, r"recorded with options={'sizes': \[1, 2\]}, expected {}"),
+        ({"options": {"sizes": (1, 3)}}, r"with options.sizes=\[1, 2\], expected \[1, 3\]"),
         ({"image_size": 32}, "demo_0 has images of 16 pixels a side, expected 32"),
     ],
 )

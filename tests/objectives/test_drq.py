@@ -38,7 +38,7 @@ def plain_shift(images, largest, generator):
     return torch.stack(shifted)
 
 
-def plain_losses(actor, critic, data, views, targets, *, demonstrated, seed=5):
+def plain_losses(actor, critic, data, views, targets, *, demonstrated, weights, seed=5):
     """Losses over M shifted copies, targets over K, one copy after the other."""
     torch.manual_seed(seed)
     generator = torch.Generator().manual_seed(7)
@@ -64,7 +64,7 @@ def plain_losses(actor, critic, data, views, targets, *, demonstrated, seed=5):
         rows = slice(m * count, (m + 1) * count)
         state = seen[rows], data["holding"]
         errors = judge(critic, *state, data["action"]) - target[:, None]
-        losses["loss_qvalue"] += errors.pow(2).mean(0).sum() / views
+        losses["loss_qvalue"] += (weights[:, None] * errors.pow(2)).mean(0).sum() / views
         td_error += errors.detach().abs().mean(-1) / views
         q = judge(frozen, *state, action[rows]).min(-1).values
         losses["loss_actor"] += (ALPHA * log_prob[rows] - q).mean() / views
@@ -76,9 +76,11 @@ def plain_losses(actor, critic, data, views, targets, *, demonstrated, seed=5):
     return losses | {"td_error": td_error}
 
 
-@pytest.mark.parametrize("demonstrated", [False, True])
+@pytest.mark.parametrize(
+    ("demonstrated", "weighted"), [(False, False), (True, False), (True, True)]
+)
 @pytest.mark.parametrize(("views", "targets"), [(2, 2), (1, 3), (3, 1)])
-def test_drq_equals_a_plain_computation(views, targets, demonstrated):
+def test_drq_equals_a_plain_computation(views, targets, demonstrated, weighted):
     ours, plain = networks()
     kind = DrQfDLoss if demonstrated else DrQLoss
     generator = torch.Generator().manual_seed(7)
@@ -92,9 +94,13 @@ def test_drq_equals_a_plain_computation(views, targets, demonstrated):
     )
     set_apart(loss)
     data = batch()
+    weights = torch.ones(BATCH, dtype=torch.double)
+    if weighted:
+        weights = data["priority_weight"] = torch.linspace(0.1, 1, BATCH, dtype=torch.double)
     torch.manual_seed(5)
     losses = loss.backward(data)
-    expected = plain_losses(*plain, batch(), views, targets, demonstrated=demonstrated)
+    options = {"demonstrated": demonstrated, "weights": weights}
+    expected = plain_losses(*plain, batch(), views, targets, **options)
     sum(value for name, value in expected.items() if name.startswith("loss_")).backward()
     assert set(losses.keys()) == set(loss.out_keys)
     assert_same_losses(dict(losses) | {"td_error": data["td_error"]}, expected)

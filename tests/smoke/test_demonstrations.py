@@ -6,6 +6,7 @@ import signal
 from functools import partial
 from pathlib import Path
 
+import h5py
 import pytest
 import torch
 
@@ -16,7 +17,7 @@ from equirl.data.episodes import DatasetError
 from equirl.data.robomimic import read_demonstrations, read_environment, write_demonstrations
 from equirl.training import Purpose, make_run_env, make_run_expert, scene_seed
 from equirl.training.demonstrations import record_demonstrations, store_demonstrations
-from tests.commands import ROOT, start
+from tests.commands import ROOT, SMOKE, start
 
 SMALL = ["env.image_size=16", "env.robot=hand"]
 PAGE = (ROOT / "docs" / "demonstrations.md").read_text()
@@ -84,7 +85,6 @@ def test_a_recording_is_what_the_run_collects_bit_for_bit(here, tmp_path, mode):
 
 
 def test_the_seed_of_each_scene_is_kept(tmp_path):
-    h5py = pytest.importorskip("h5py")
     config = configuration(
         env={"task": "clutter_grasping", "image_size": 16, "robot": "hand"}, demos={"episodes": 2}
     )
@@ -127,12 +127,59 @@ def test_demonstrations_of_another_environment_do_not_train(tmp_path):
         ({"env": base | {"image_size": 32}}, "images of 16 pixels a side, expected 32"),
         ({"env": base | {"task": "block_pushing"}}, "task='block_picking', expected 'block_push"),
         ({"env": base | {"robot": "panda"}}, "robot='hand', expected 'panda'"),
-        ({"env": base | {"options": {"lift_height": 0.12}}}, "options={}, expected {'lift_"),
+        (
+            {"env": base | {"options": {"lift_height": 0.12}}},
+            "with options.lift_height=0.15, expected 0.12",
+        ),
         ({"demos": {"episodes": 3}}, "holds 2 successful demonstrations, expected 3"),
     ):
         demos = {"episodes": 2} | changes.get("demos", {}) | {"file": str(path)}
         with pytest.raises(DatasetError, match=message):
             stored(configuration(**changes | {"demos": demos}), make_buffer())
+
+
+def test_a_number_spelled_out_is_that_left_out(tmp_path):
+    path = tmp_path / "demos.hdf5"
+    record_demonstrations(configuration(), path)
+    env = {"task": "block_picking", "image_size": 16, "robot": "hand"}
+    env["options"] = {"lift_height": 0.15}  # the task's own
+    stored(configuration(env=env, demos={"episodes": 2, "file": str(path)}), make_buffer())
+
+
+def test_a_task_without_an_expert_trains_from_a_file(here, tmp_path, monkeypatch):
+    (tmp_path / "quiet_tasks.py").write_text(
+        "from dataclasses import dataclass\n"
+        "from equirl.envs.tasks.block_picking import BlockPicking\n\n\n"
+        "@dataclass(frozen=True, kw_only=True)\n"
+        "class Quiet(BlockPicking):\n"
+        "    expert = None\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    path = tmp_path / "mine.hdf5"
+    write_demonstrations(path, collected(configuration()))
+    run = tmp_path / "run"
+    arguments = ["env.task=quiet_tasks:Quiet", f"demos.file={path}", f"output={run}"]
+    code, _, err = here("train.py", *SMOKE, "env.robot=hand", *arguments)
+    assert code == 0, err
+    code, _, err = here("train.py", *SMOKE, "env.task=quiet_tasks:Quiet")
+    assert code == 1 and "has no expert; expected 0, or demos.file" in err
+
+
+def test_a_sweep_over_files_is_compared_like_any_other(here, tmp_path):
+    files = [tmp_path / name for name in ("one.hdf5", "two.hdf5")]
+    for file in files:
+        record_demonstrations(configuration(), file)
+    sweep, given = tmp_path / "sweep", ",".join(map(str, files))
+    code, _, err = here(
+        "train.py", "--multirun", *SMOKE, "env.robot=hand", f"demos.file={given}",
+        f"hydra.sweep.dir={sweep}",
+    )  # fmt: skip
+    assert code == 0, err
+    runs = sorted(each.parent.parent for each in tmp_path.rglob("test.csv"))
+    assert runs == [sweep, sweep]  # a folder each, side by side
+    code, out, err = here("compare.py", str(tmp_path / "comparison"), str(sweep))
+    assert code == 0, err
+    assert "one.hdf5" in out and "two.hdf5" in out
 
 
 def test_a_file_is_overwritten_on_request_only(here, tmp_path):
