@@ -140,8 +140,8 @@ def test_cnn_baseline(here, tmp_path):
     ("arguments", "named"),
     [
         (["group=so3"], "group=so3"),
-        (["method=drq"], "drq"),
-        (["algorithm=sacfd"], "sacfd"),
+        (["method=curl"], "curl"),
+        (["algorithm=td3"], "td3"),
         (["env=block_stacking"], "block_stacking"),
         (["env.image_size=100"], "image_size=100 is not supported: expected one of 16, 32, 64"),
         (["colour=red"], "colour"),
