@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 __all__ = ["plot_run", "plot_runs"]
 
+_LEGEND_LETTERS = 125  # in a row below two panels
+
 
 def plot_run(folder: Path, path: Path) -> None:
     """Draws one run: behaviour return, greedy success, losses, entropy and temperature.
@@ -57,7 +59,8 @@ def plot_runs(groups: Mapping[str, Sequence[Path]], path: Path, *, title: str = 
         _draw_return(right, folders, label, colour)
     handles, labels = left.get_legend_handles_labels()
     if labels:  # none without validations
-        columns = min(len(labels), 7)
+        widest = max(map(len, labels)) + 7  # letters, with the line before them
+        columns = max(1, min(len(labels), _LEGEND_LETTERS // widest))
         figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
     figure.suptitle(title)
     save(figure, path)
