@@ -101,6 +101,10 @@ def test_group_is_normalised(given, kept):
         ({"replay": {"beta": 1.5}}, "replay.beta=1.5: expected 0 to 1"),
         ({"replay": {"exponent": 8.0}}, "replay.exponent=8.0: expected 0 to 1"),
         (
+            {"replay": {"capacity": 245, "start": 10}},
+            "replay.capacity=245: a demonstration is stored whole, .* with their copies, 250",
+        ),
+        (
             {"method": {"name": "drq", "shift": 64}},
             "method.shift=64: expected less than half of env.image_size=128",
         ),

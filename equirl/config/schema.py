@@ -279,6 +279,13 @@ class Config:
             )
         if self.sampling == "symmetric" and self.algorithm.batch_size < 2:
             raise ConfigError("replay.sampling=symmetric: expected algorithm.batch_size above 1")
+        rows, longest = self.replay.capacity // (self.copies + 1), self.env.max_steps
+        if demonstrations and rows < longest:
+            raise ConfigError(
+                f"replay.capacity={self.replay.capacity}: a demonstration is stored whole, "
+                f"expected room for {longest} transitions with their copies, "
+                f"{longest * (self.copies + 1)}"
+            )
         if self.demos.file and not demonstrations:
             raise ConfigError(
                 f"demos.file={self.demos.file}: expected demos.episodes above 0, got 0"

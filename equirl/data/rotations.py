@@ -90,7 +90,7 @@ class RotationAugmentation(_Rotation):
         bounds: Keys whose turned values are clipped, with lowest and highest value; when
             None, ``action`` to [-1, 1] if the spec names it. An action whose (x, y) lies off
             the unit disc can leave its box when turned, and the paper's system clips it; on
-            the disc, where ``strict`` actions live, nothing is clipped.
+            the disc, where equivariant ``strict`` policies act, nothing is clipped.
         quarter_turns: Whether copies are turned by multiples of 90 degrees only, all four
             equally likely: pixels are then permuted, not interpolated.
 
