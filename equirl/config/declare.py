@@ -16,6 +16,7 @@ __all__ = [
     "checked",
     "flatten",
     "keys_of",
+    "mark",
     "one_of",
     "within",
 ]
@@ -25,9 +26,9 @@ class ConfigError(ValueError):
     """A key or value that no run can have; the message names it."""
 
 
-def at_least(default: Any, lowest: float, *, free: bool = False) -> Any:
-    """A number from ``lowest`` on."""
-    return checked(default, lambda value: value >= lowest, f"{lowest} or more", free=free)
+def at_least(default: Any, lowest: float, **marks: bool) -> Any:
+    """A number from ``lowest`` on; see `mark` for what else can be said of it."""
+    return checked(default, lambda value: value >= lowest, f"{lowest} or more", **marks)
 
 
 def within(default: float, low: float, high: float) -> Any:
@@ -36,7 +37,7 @@ def within(default: float, low: float, high: float) -> Any:
     return checked(default, lambda value: low < value <= high, expected)
 
 
-def one_of(default: str, *allowed: str, source: str = "", free: bool = False) -> Any:
+def one_of(default: str, *allowed: str, source: str = "", **marks: bool) -> Any:
     """One of several words: the default, ``allowed``, or those that ``source`` lists.
 
     ``source`` is ``"module:name"``, looked up when a value is checked, so that the schema needs
@@ -52,7 +53,7 @@ def one_of(default: str, *allowed: str, source: str = "", free: bool = False) ->
         default,
         lambda value: value in words(),
         lambda: f"one of {', '.join(words())}",
-        free=free,
+        **marks,
     )
 
 
@@ -60,17 +61,26 @@ def checked(
     default: Any,
     valid: Callable[[Any], bool],
     expected: str | Callable[[], str],
-    *,
-    free: bool = False,
+    **marks: bool,
 ) -> Any:
     """A value that ``valid`` accepts; ``expected`` says in words what that is."""
-    metadata = {"valid": valid, "expected": expected, "free": free}
-    return field(default=default, metadata=metadata)
+    return field(default=default, metadata={"valid": valid, "expected": expected, **mark(**marks)})
 
 
-def keys_of(schema: type, *, free: bool = False) -> Any:
-    """A group of keys; ``free`` ones may differ when a run is resumed, see `is_free`."""
-    return field(default_factory=schema, metadata={"free": free})
+def keys_of(schema: type, **marks: bool) -> Any:
+    """A group of keys, all marked alike."""
+    return field(default_factory=schema, metadata=mark(**marks))
+
+
+def mark(*, free: bool = False, execution: bool = False) -> dict[str, bool]:
+    """What a key touches, as metadata of its field.
+
+    Args:
+        free: Not what is learned: another value may be given when a run is resumed.
+        execution: Nothing but where and how the run is computed, which makes it free, too: with
+            another value it is the same run.
+    """
+    return {"free": free or execution, "execution": execution}
 
 
 def check_values(config: Any, prefix: str = "") -> None:

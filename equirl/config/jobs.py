@@ -8,10 +8,19 @@ from typing import Any
 
 from omegaconf import MISSING
 
+from equirl.config.checks import make_run_task
 from equirl.config.declare import ConfigError, at_least, checked, keys_of, one_of
-from equirl.config.schema import BACKENDS_SOURCE, Config, EnvConfig, make_run_task
+from equirl.config.schema import BACKENDS_SOURCE, Config, EnvConfig
 
-__all__ = ["DemonstrationsJob", "EvaluateJob", "ExportJob", "ReportJob", "TrainJob", "WatchJob"]
+__all__ = [
+    "DemonstrationsJob",
+    "EvaluateJob",
+    "ExportJob",
+    "FiguresJob",
+    "ReportJob",
+    "TrainJob",
+    "WatchJob",
+]
 
 
 @dataclass
@@ -20,6 +29,7 @@ class TrainJob(Config):
 
     output: str = ""  # the run's folder; a new one under outputs/ when empty
     resume: str = ""  # folder of an interrupted run to go on with
+    dry_run: bool = False  # list the runs with the hours each takes on this machine; train none
 
 
 @dataclass
@@ -148,3 +158,15 @@ class WatchJob:
         if self.policy == "expert" and task.expert is None:
             raise ConfigError(f"policy=expert: {self.env.task} has no expert; there is random")
         return self
+
+
+@dataclass
+class FiguresJob:
+    """What the command line of ``experiments/figures.py`` takes."""
+
+    sweep: str = MISSING  # the folder of a sweep, or of one run
+    # Of the paper: groups, 12, 13, 14, 15 or 16, which gives the title and says what is missing.
+    figure: str = ""
+    smoothing: int = at_least(500, 1)  # steps that a return is averaged over, the paper's
+    title: str = ""  # above the figure; the paper's when empty
+    output: str = ""  # the folder of picture and tables; the sweep's own when empty

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 from difflib import get_close_matches
 from pathlib import Path
@@ -22,6 +21,7 @@ from equirl.config.jobs import (
     DemonstrationsJob,
     EvaluateJob,
     ExportJob,
+    FiguresJob,
     ReportJob,
     TrainJob,
     WatchJob,
@@ -122,22 +122,10 @@ def load_config(path: Path) -> Config:
         raise ConfigError(f"{path} is not a readable configuration: {reason}") from None
 
 
-def _shortened(name: str, longest: int = 200) -> str:
-    """A name that serves for one folder: what is too long, or is a path, ends in a digest of it."""
-    plain = name.replace("/", "-").lstrip(".")
-    if plain == name and len(name) <= longest:
-        return name
-    return f"{plain[: longest - 9]}_{hashlib.blake2b(name.encode(), digest_size=4).hexdigest()}"
-
-
 def register() -> None:
-    """Makes the schema known to Hydra, so that every key of a YAML file is validated.
-
-    Also the resolver ``shortened``, for the folders of a sweep.
-    """
+    """Makes the schema known to Hydra, so that every key of a YAML file is validated."""
     from hydra.core.config_store import ConfigStore
 
-    OmegaConf.register_new_resolver("shortened", _shortened, replace=True)
     store = ConfigStore.instance()
     schemas = {"train": TrainJob, "watch": WatchJob, "demonstrations": DemonstrationsJob}
     for name, schema in schemas.items():
@@ -152,3 +140,4 @@ def register() -> None:
     store.store(name="evaluate_schema", node=EvaluateJob)
     store.store(name="export_schema", node=ExportJob)
     store.store(name="report_schema", node=ReportJob)
+    store.store(name="figures_schema", node=FiguresJob)

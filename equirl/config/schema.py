@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import MISSING
 
-from equirl.config.declare import ConfigError, at_least, checked, keys_of, one_of, within
+from equirl.config.checks import check_together
+from equirl.config.declare import ConfigError, at_least, checked, keys_of, mark, one_of, within
 
 if TYPE_CHECKING:
-    from equirl.envs.tasks import Task
     from equirl.modules.methods import Method
 
 __all__ = [
@@ -25,14 +25,13 @@ __all__ = [
     "LoggingConfig",
     "MethodConfig",
     "ReplayConfig",
+    "is_execution",
     "is_free",
-    "make_run_task",
 ]
 
 # Where the rooms list what there is to choose from.
 _MODES = "equirl.symmetry.spec:MODES"
 BACKENDS_SOURCE = "equirl.modules.backend:BACKENDS"
-_METHODS = "equirl.modules.methods:METHODS"
 _ROBOTS = "equirl.envs:ROBOTS"
 
 
@@ -51,7 +50,7 @@ class EnvConfig:
 class MethodConfig:
     """The networks."""
 
-    name: str = one_of(MISSING, source=_METHODS)
+    name: str = MISSING  # of equirl.modules.METHODS, or "package.module:NAME"
     hidden: int = at_least(64, 1)  # width n of the encoder (appendix A); the CNN scales with it
     head_width: int = at_least(0, 0)  # fields of an equivariant critic head; 0: hidden (the paper)
     # Of drq: shifted copies of a state, pixels of a shift.
@@ -138,6 +137,7 @@ class LoggingConfig:
     wandb: bool = False
     wandb_mode: str = one_of("offline", "online")
     wandb_project: str = "equirl"
+    private: bool = True  # no name of host or user, no absolute path in run.json and at wandb
 
 
 @dataclass
@@ -151,15 +151,17 @@ class Config:
     demos: DemosConfig = keys_of(DemosConfig)
     replay: ReplayConfig = keys_of(ReplayConfig)
     evaluation: EvaluationConfig = keys_of(EvaluationConfig, free=True)
-    logging: LoggingConfig = keys_of(LoggingConfig, free=True)
+    logging: LoggingConfig = keys_of(LoggingConfig, execution=True)
     mode: str = one_of("strict", source=_MODES)  # the mathematics, independent of sizes
     group: str = "D4"  # C<n> or D<n>, n from 2 to 1000, SO2 or O2
     steps: int = at_least(10_000, 1, free=True)  # environment steps
-    checkpoint_every: int = at_least(500, 1, free=True)  # steps
+    checkpoint_every: int = at_least(500, 1, execution=True)  # steps
     seed: int = at_least(0, 0)  # of networks, scenes, actions and replay
-    device: str = field(default="auto", metadata={"free": True})  # "auto", "cpu" or "cuda:<i>"
-    threads: int = at_least(0, 0, free=True)  # CPU threads of torch; 0: all cores
-    backend: str = one_of("auto", source=BACKENDS_SOURCE, free=True)  # of equivariant encoders
+    # "auto", "cpu" or "cuda:<i>".
+    device: str = field(default="auto", metadata=mark(execution=True))
+    threads: int = at_least(0, 0, execution=True)  # CPU threads of torch; 0: all cores
+    # Of equivariant encoders.
+    backend: str = one_of("auto", source=BACKENDS_SOURCE, execution=True)
 
     @property
     def torch_device(self) -> str:
@@ -201,19 +203,18 @@ class Config:
         """Pixels a side of what the environment shows; methods that crop see less of it."""
         from equirl.modules.layout import uncropped
 
-        size = self.env.image_size
-        return uncropped(size) if self._crops else size
+        size, parts = self.env.image_size, self.method_parts
+        return uncropped(size) if parts and parts.crops else size
 
     @property
-    def _crops(self) -> bool:
-        return self._method is not None and self._method.crops
-
-    @property
-    def _method(self) -> Method | None:
+    def method_parts(self) -> Method | None:
         """What makes up the method; None if there is no such one."""
         from equirl.modules.methods import METHODS
 
-        return METHODS.get(self.method.name)
+        try:
+            return METHODS[self.method.name]
+        except ValueError:
+            return None
 
     @property
     def shift(self) -> int:
@@ -226,109 +227,7 @@ class Config:
         Raises:
             ConfigError: They do not; the message names the first that does not.
         """
-        from equirl.modules.layout import check_sizes
-        from equirl.symmetry import SymmetryGroup
-
-        try:
-            group = SymmetryGroup(self.group).name
-        except ValueError as error:
-            raise ConfigError(f"group={self.group}: {error}") from None
-        _check_expert(self.env, self.demos)
-        try:
-            check_sizes(self.method.hidden, self.env.image_size)
-        except ValueError as error:
-            crops = (
-                f". With method={self.method.name} env.image_size is the side of the crop: the "
-                "environment shows more by itself, 142 pixels for 128"
-            )
-            more = crops if self._crops else ""
-            raise ConfigError(f"method.hidden or env.image_size: {error}{more}") from None
-        self._check_method()
-        capacity, versions = self.replay.capacity, self.copies + 1
-        if capacity < versions:
-            raise ConfigError(f"replay.capacity={capacity}: expected {versions} or more")
-        if self.replay.start > capacity - capacity % versions:
-            raise ConfigError(
-                f"replay.start={self.replay.start}: the buffer of {capacity} transitions never "
-                "holds so many"
-            )
-        self._check_demonstrations()
-        return replace(self, group=group)
-
-    def _check_method(self) -> None:
-        """Checks numbers of a method against those of others."""
-        method, batch = self._method, self.algorithm.batch_size
-        if method and method.shifts and 2 * self.shift >= self.env.image_size:
-            raise ConfigError(
-                f"method.shift={self.shift}: expected less than half of "
-                f"env.image_size={self.env.image_size}"
-            )
-        if method and method.contrastive and batch < 2:
-            raise ConfigError(
-                f"algorithm.batch_size={batch}: method={self.method.name} tells the observations "
-                "of a batch apart, expected 2 or more"
-            )
-
-    def _check_demonstrations(self) -> None:
-        """Checks that what needs demonstrations has them, and has them from one place."""
-        demonstrations = self.demos.episodes
-        if self.sampling == "symmetric" and not demonstrations:
-            raise ConfigError(
-                "replay.sampling=symmetric: half of each batch is demonstrations, expected "
-                f"demos.episodes above 0, got {demonstrations}"
-            )
-        if self.sampling == "symmetric" and self.algorithm.batch_size < 2:
-            raise ConfigError("replay.sampling=symmetric: expected algorithm.batch_size above 1")
-        rows, longest = self.replay.capacity // (self.copies + 1), self.env.max_steps
-        if demonstrations and rows < longest:
-            raise ConfigError(
-                f"replay.capacity={self.replay.capacity}: a demonstration is stored whole, "
-                f"expected room for {longest} transitions with their copies, "
-                f"{longest * (self.copies + 1)}"
-            )
-        if self.demos.file and not demonstrations:
-            raise ConfigError(
-                f"demos.file={self.demos.file}: expected demos.episodes above 0, got 0"
-            )
-        if self.demos.file and self.demos.options:
-            raise ConfigError(
-                f"demos.options={self.demos.options}: expected none, the demonstrations of "
-                f"demos.file={self.demos.file} are what they are"
-            )
-
-
-def make_run_task(env: EnvConfig) -> Task:
-    """The task of an environment's keys.
-
-    Raises:
-        ConfigError: There is no such task, or it refuses its options.
-    """
-    from equirl.envs.tasks import find_task, make_task
-
-    if env.image_size % 2:
-        raise ConfigError(f"env.image_size={env.image_size}: expected an even number")
-    try:
-        kind = find_task(env.task)
-    except ValueError as error:
-        raise ConfigError(f"env.task: {error}") from None
-    try:
-        return make_task(kind, **env.options)
-    except (ValueError, ImportError) as error:
-        raise ConfigError(f"env.options: {error}") from None
-
-
-def _check_expert(env: EnvConfig, demos: DemosConfig) -> None:
-    task = make_run_task(env)
-    if not demos.episodes or demos.file:
-        return
-    if task.expert is None:
-        raise ConfigError(
-            f"demos.episodes={demos.episodes}: {env.task} has no expert; expected 0, or demos.file"
-        )
-    try:
-        task.expert.resolve(demos.options)
-    except ValueError as error:
-        raise ConfigError(f"demos.options: {error}") from None
+        return replace(self, group=check_together(self))
 
 
 def is_free(key: str) -> bool:
@@ -337,5 +236,18 @@ def is_free(key: str) -> bool:
     Args:
         key: A key of `Config`, ``"env.task"``, or a group of them, ``"env"``.
     """
-    known = {entry.name: entry.metadata.get("free", False) for entry in fields(Config)}
+    return _is_marked(key, "free")
+
+
+def is_execution(key: str) -> bool:
+    """Whether a key says nothing but where and how a run is computed: it is the same with others.
+
+    Args:
+        key: As of `is_free`.
+    """
+    return _is_marked(key, "execution")
+
+
+def _is_marked(key: str, name: str) -> bool:
+    known = {entry.name: entry.metadata.get(name, False) for entry in fields(Config)}
     return known.get(key.partition(".")[0], False)

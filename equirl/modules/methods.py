@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib import import_module
 from typing import NamedTuple
 
 from tensordict.nn import TensorDictSequential
@@ -40,12 +41,33 @@ class Method(NamedTuple):
     contrastive: bool = False
 
 
-METHODS = {
-    "equivariant": Method(make_actor, make_critic, equivariant=True),
-    "cnn": Method(make_cnn_actor, make_cnn_critic, equivariant=False),
-    "drq": Method(make_cnn_actor, make_cnn_critic, equivariant=False, shifts=True),
-    "rad": Method(make_rad_actor, make_rad_critic, equivariant=False, crops=True),
-    "ferm": Method(
-        make_ferm_actor, make_ferm_critic, equivariant=False, crops=True, contrastive=True
-    ),
-}
+class _Methods(dict[str, Method]):
+    """Methods by name; those that are defined elsewhere by ``"package.module:NAME"``."""
+
+    def __missing__(self, name: str) -> Method:
+        """Imports a method.
+
+        Raises:
+            ValueError: There is none of that name; `dict.get` does not import and gives None.
+        """
+        module, colon, attribute = name.partition(":")
+        if not colon:
+            raise ValueError(
+                f"expected one of {', '.join(self)} or 'package.module:NAME', got {name!r}"
+            )
+        try:
+            method = getattr(import_module(module), attribute)
+        except (ImportError, AttributeError, ValueError) as error:
+            raise ValueError(f"method {name!r} cannot be imported: {error}") from None
+        if not isinstance(method, Method):
+            raise ValueError(f"a method must be an {__name__}.Method, got {method!r}")
+        return method
+
+
+METHODS = _Methods(
+    equivariant=Method(make_actor, make_critic, equivariant=True),
+    cnn=Method(make_cnn_actor, make_cnn_critic, equivariant=False),
+    drq=Method(make_cnn_actor, make_cnn_critic, equivariant=False, shifts=True),
+    rad=Method(make_rad_actor, make_rad_critic, equivariant=False, crops=True),
+    ferm=Method(make_ferm_actor, make_ferm_critic, equivariant=False, crops=True, contrastive=True),
+)

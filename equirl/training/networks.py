@@ -42,5 +42,6 @@ def describe_method(config: Config) -> str:
     algorithm = {"sac": "SAC", "sacfd": "SACfD"}[config.algorithm.name]
     if METHODS[config.method.name].equivariant:
         return f"{config.group}-equivariant {algorithm} ({config.mode} mode)"
-    name = {"drq": "DrQ"}.get(config.method.name, config.method.name.upper())
+    name = config.method.name.rpartition(":")[2]  # of one's own, "package.module:NAME"
+    name = {"drq": "DrQ"}.get(name, name.upper())
     return f"{name} {algorithm}"

@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -40,12 +41,15 @@ def test_links_and_scripts_exist(page):
 
 def test_the_architecture_names_what_is_there():
     """Every name of code in the page occurs in the code."""
-    files = [*ROOT.glob("equirl/**/*.py"), *ROOT.glob("experiments/*.py"), *ROOT.glob("conf/*")]
-    source = "\n".join(path.read_text() for path in files if path.is_file())
+    inside = list(
+        chain.from_iterable(ROOT.glob(f"{room}/**/*") for room in ("equirl", "experiments"))
+    )
+    files = [path for path in (*inside, *ROOT.glob("conf/*")) if path.suffix in (".py", ".yaml")]
+    source = "\n".join(path.read_text() for path in files)
     page = (ROOT / "docs" / "architecture.md").read_text()
     names = set(re.findall(r"`([A-Za-z_][\w.]*)(?:\(\))?`", page))
     parts = {part for name in names for part in name.split(".")}
-    folders = {path.name for path in [*ROOT.glob("*"), *ROOT.glob("equirl/**/*")]}
+    folders = {path.name for path in [*ROOT.glob("*"), *inside]}
     missing = {p for p in parts if p not in folders and not re.search(rf"\b{p}\b", source)}
     assert len(names) > 20 and not missing and "@" not in page
 
