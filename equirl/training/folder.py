@@ -6,24 +6,33 @@ import fcntl
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
 from equirl.config import Config, ConfigError, flatten, load_config
+from equirl.config.schema import is_execution
 from equirl.training.checkpoint import check_same_config, load_checkpoint
 
 __all__ = [
+    "CHANGES",
     "CHECKPOINT",
     "CONFIG",
     "CURVES",
+    "FAILED",
     "FILES",
+    "LOCK",
     "METRICS",
+    "RECORD",
     "REPORT",
+    "TENSORBOARD",
     "TEST",
     "VIDEO",
+    "WANDB",
     "FolderError",
+    "FolderInUse",
     "check_folder",
     "claim_folder",
     "is_finished",
@@ -34,6 +43,8 @@ __all__ = [
 CONFIG, CHECKPOINT, LOCK = "config.yaml", "checkpoint.pt", ".lock"
 METRICS, TEST = "metrics.csv", "test.csv"
 REPORT, CURVES, VIDEO = "report.md", "curves.png", "policy.mp4"
+RECORD, CHANGES, FAILED = "run.json", "changes.patch", "failed.txt"
+TENSORBOARD, WANDB = "tensorboard", "wandb"
 
 #: What a run leaves in its folder.
 FILES = {
@@ -47,12 +58,25 @@ FILES = {
     CHECKPOINT: "networks, optimiser, replay buffer: all a resume needs",
     CURVES: "learning curves",
     VIDEO: "the learned policy at work",
+    RECORD: "versions, code, machine, seeds, and when the run was trained",
+    CHANGES: "how the code differed from its commit",
+    FAILED: "why it failed when it was trained last",
+    "log.txt": "what it said, when a launcher ran it",
+    TENSORBOARD: "the tables for TensorBoard",
+    WANDB: "the tables for wandb",
     REPORT: "this page",
 }
+
+#: Seconds within which a lock is given back that somebody took to see whether a run is there.
+_LOOK = 1.0
 
 
 class FolderError(RuntimeError):
     """A folder that a run cannot use; the message says why."""
+
+
+class FolderInUse(FolderError):
+    """A folder that another process is training in: later it can be used."""
 
 
 def check_folder(folder: Path, config: Config) -> None:
@@ -63,7 +87,8 @@ def check_folder(folder: Path, config: Config) -> None:
         CheckpointError: It holds the checkpoint of a run of another configuration.
     """
     partial = {path.name for path in folder.glob("*.partial*")}  # of writings cut short
-    others = {path.name for path in folder.iterdir()} - {LOCK} - partial
+    # Trackers begin before the configuration is written.
+    others = {path.name for path in folder.iterdir()} - {LOCK, TENSORBOARD, WANDB} - partial
     if not others:
         return
     if CONFIG not in others:
@@ -86,14 +111,17 @@ def check_folder(folder: Path, config: Config) -> None:
 
 
 def is_finished(folder: Path, config: Config) -> bool:
-    """Whether the folder holds the end of just this run.
+    """Whether the folder holds the end of just this run, wherever and however it was computed.
 
     Raises:
         CheckpointError: Its checkpoint is damaged.
     """
     if not all((folder / name).exists() for name in (CONFIG, CHECKPOINT, TEST, REPORT)):
         return False
-    if flatten(load_run_config(folder)) != flatten(config):
+    stored = flatten(load_run_config(folder))
+    if any(
+        stored[key] != value and not is_execution(key) for key, value in flatten(config).items()
+    ):
         return False
     state = load_checkpoint(folder / CHECKPOINT)
     check_same_config(flatten(config), state["config"], folder / CHECKPOINT)
@@ -117,7 +145,8 @@ def claim_folder(folder: Path) -> Iterator[None]:
     context becomes a FolderError too.
 
     Raises:
-        FolderError: Another run is using the folder, or it cannot be written.
+        FolderInUse: Another run is using the folder.
+        FolderError: It cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -131,11 +160,16 @@ def claim_folder(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
+    deadline = time.monotonic() + _LOOK
     with open(folder / LOCK, "w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise FolderError(f"another run is writing to {folder}") from None
+        while True:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if time.monotonic() > deadline:
+                    raise FolderInUse(f"another run is writing to {folder}") from None
+                time.sleep(_LOOK / 20)
         yield
 
 

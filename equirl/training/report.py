@@ -11,6 +11,7 @@ from equirl.training.environment import describe_task
 from equirl.training.evaluation import Evaluation
 from equirl.training.folder import CURVES, FILES, REPORT
 from equirl.training.networks import describe_method
+from equirl.training.provenance import read_record, summarize_record
 
 __all__ = ["write_report"]
 
@@ -66,6 +67,8 @@ def write_report(
         lines += [f"Test scenes it failed, by number: {', '.join(failures)}.", ""]
     if not timing.get("update_ms", [0.0])[-1]:
         lines += ["**No update was made**: the replay buffer never held enough.", ""]
+    if record := read_record(folder):
+        lines += ["## How it was made", "", *summarize_record(record), ""]
     lines += [
         "| file | what |",
         "| --- | --- |",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from equirl.training.evaluation import Evaluation
 from equirl.training.folder import (
     CONFIG,
     CURVES,
+    FAILED,
     REPORT,
     TEST,
     VIDEO,
@@ -25,6 +26,7 @@ from equirl.training.folder import (
     stop_on_interrupt,
 )
 from equirl.training.loop import TrainingRun
+from equirl.training.provenance import record_session
 from equirl.training.report import write_report
 from equirl.training.seeding import Purpose, scene_seed
 from equirl.training.video import film_policy
@@ -34,22 +36,25 @@ __all__ = ["read_evaluation", "train", "write_evaluation"]
 _log = logging.getLogger("equirl")
 
 
-def train(config: Config, folder: str | Path) -> Evaluation | None:
+def train(
+    config: Config, folder: str | Path, should_stop: Callable[[], bool] = lambda: False
+) -> Evaluation | None:
     """Trains in a folder, or goes on with the run it holds, and reports there.
 
     Args:
         config: A validated configuration.
         folder: The run's folder; made when missing.
+        should_stop: Asked after each step and each episode; True ends the run as Ctrl-C does.
 
     Returns:
-        The trained policy's success on the test scenes, or None when Ctrl-C stopped the
-        run; calling again then goes on where it stopped. A run that is finished already is
-        left alone.
+        The trained policy's success on the test scenes, or None when Ctrl-C or ``should_stop``
+        stopped the run; calling again then goes on where it stopped. A run that is finished
+        already is left alone.
 
     Raises:
         ConfigError: A device, a tracker, or the memory that this machine does not have.
-        FolderError: The folder cannot be written, holds something else, or another run
-            is using it.
+        FolderInUse: Another run is using the folder.
+        FolderError: The folder cannot be written, or holds something else.
         CheckpointError: The folder holds a run of another configuration, or a
             checkpoint cannot be written or read.
         TableError: A table of the run to go on with is damaged.
@@ -58,23 +63,41 @@ def train(config: Config, folder: str | Path) -> Evaluation | None:
         KeyboardInterrupt: At the second Ctrl-C; what the checkpoint holds is safe.
     """
     folder = Path(folder)
-    with claim_folder(folder), stop_on_interrupt() as should_stop, _memory_told():
+    with claim_folder(folder), stop_on_interrupt() as interrupted, _memory_told():
         check_folder(folder, config)
+        (folder / FAILED).unlink(missing_ok=True)  # of an earlier attempt: this one may be killed
         if is_finished(folder, config):
             _log.info("this run is finished already")
             return read_evaluation(folder / TEST)
-        with closing(TrainingRun(config, folder, should_stop)) as run:
+        with closing(TrainingRun(config, folder, lambda: interrupted() or should_stop())) as run:
             run.restore()
             save_config(config, folder / CONFIG)  # only now: it fits what is there
             for name in (TEST, REPORT, CURVES, VIDEO):  # of an earlier end: of another policy
                 (folder / name).unlink(missing_ok=True)
-            evaluation = run.run()
-            if evaluation is None:
-                return None
-            write_evaluation(evaluation, folder / TEST)
-            filmed = config.evaluation.video_episodes > 0 and _film(run, folder / VIDEO)
-            write_report(folder, config, evaluation, video=folder / VIDEO if filmed else None)
+            with record_session(config, folder, lambda: run.step) as session:
+                evaluation = run.run()
+                if evaluation is None:
+                    return None
+                write_evaluation(evaluation, folder / TEST)
+                filmed = config.evaluation.video_episodes > 0 and _film(run, folder / VIDEO)
+                video = folder / VIDEO if filmed else None
+                run.log.conclude(_test_results(run.step, evaluation), video)
+                session.end("finished")  # the report tells how long it took
+                write_report(folder, config, evaluation, video=video)
     return evaluation
+
+
+def _test_results(step: int, evaluation: Evaluation) -> dict[str, float | int]:
+    """The test as a row, for trackers; the folder has a row an episode."""
+    low, high = evaluation.interval
+    return {
+        "step": step,
+        "episodes": len(evaluation.episodes),
+        "success_rate": evaluation.success_rate,
+        "low": low,
+        "high": high,
+        "discounted_return": evaluation.discounted_return,
+    }
 
 
 @contextmanager

@@ -250,7 +250,7 @@ def test_two_runs_into_one_folder(here, tmp_path):
     first = start("train.py", *RUN, "steps=1000000", f"output={folder}")
     wait_for(lambda: rows(folder) > 1)
     code, _, err = here("train.py", *RUN, f"output={folder}")
-    assert code == 1 and f"another run is writing to {folder}" in sentence(err)
+    assert code == 75 and f"another run is writing to {folder}" in sentence(err)
     first.send_signal(signal.SIGINT)
     assert finish(first)[0] == 130
     assert "steps: 1000000" in (folder / "config.yaml").read_text()
