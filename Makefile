@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 KERNELS := $(wildcard equirl/modules/native/*.[ch]pp)
 
-.PHONY: setup demo test test-all lint format benchmark clean
+.PHONY: setup demo test test-all lint format benchmark docs clean
 
 setup: $(READY)
 
@@ -14,7 +14,7 @@ $(READY): setup.py setup.cfg pyproject.toml constraints.txt $(KERNELS)
 	@command -v $(PYTHON) >/dev/null || { echo "error: $(PYTHON) not found; equirl needs Python 3.11 (PyBullet has no newer wheels)"; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
-	$(BIN)/uv pip install --quiet --compile-bytecode --python $(BIN)/python -c constraints.txt -e '.[dev,tracking,meshes,sb3,export]'
+	$(BIN)/uv pip install --quiet --compile-bytecode --python $(BIN)/python -c constraints.txt -e '.[dev,tracking,meshes,sb3,export,launchers,docs]'
 	touch $@
 
 # Trains on Block Picking from nothing to a report; interrupted, it goes on where it stopped.
@@ -39,7 +39,11 @@ format: setup
 benchmark: setup
 	$(BIN)/python experiments/benchmark.py
 
+# The pages of docs/ and the reference of all public names: open site/index.html.
+docs: setup
+	$(BIN)/python docs/build_site.py
+
 clean:
-	rm -rf $(VENV) build *.egg-info .pytest_cache .hypothesis .mypy_cache .ruff_cache
+	rm -rf $(VENV) build site *.egg-info .pytest_cache .hypothesis .mypy_cache .ruff_cache
 	rm -f equirl/modules/native/*.so
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -50,7 +50,7 @@ def entry_point(name: str, schema: type[Job]) -> Callable[[Callable[[Job], None]
                 with _messages():
                     main(to_config(values, schema))
             except Exception as error:  # and not an interrupt, that must not import anything
-                if not isinstance(error, _mendable()):
+                if not isinstance(error, mendable()):
                     raise
                 if not is_multirun():
                     sys.exit(f"error: {error}")
@@ -64,13 +64,17 @@ def entry_point(name: str, schema: type[Job]) -> Callable[[Callable[[Job], None]
             register()
             conf = Path(__file__).parents[1] / "conf"
             previous = signal.signal(signal.SIGINT, _end)
+            given = sys.argv
+            if _asks_for_experiment(given[1:]):
+                sys.argv = [given[0], "--multirun", *given[1:]]
             try:
                 hydra.main(version_base="1.3", config_path=str(conf), config_name=name)(job)()
             except Exception as error:
                 if composed:
                     raise
-                sys.exit(f"error: {explain(error, schema)}")
+                sys.exit(f"error: {explain(error, schema)}{_missing_launcher(error)}")
             finally:
+                sys.argv = given
                 if signal.getsignal(signal.SIGINT) is _end:  # else it was stopped for good
                     signal.signal(signal.SIGINT, previous)
             if failed:
@@ -79,6 +83,23 @@ def entry_point(name: str, schema: type[Job]) -> Callable[[Callable[[Job], None]
         return run
 
     return decorate
+
+
+def _asks_for_experiment(arguments: list[str]) -> bool:
+    """Whether this is a sweep by its experiment, which says so in its file.
+
+    Hydra would find out by itself, but not where there is a mistake in what is beside it, and
+    then complains of the commas.
+    """
+    flags = [text for text in arguments if text.startswith("-")]
+    return not flags and any(text.startswith("+experiment=") for text in arguments)
+
+
+def _missing_launcher(error: Exception) -> str:
+    """What to install, where a launcher is asked for that is not there."""
+    if "hydra/launcher" not in str(error):
+        return ""
+    return "; joblib, slurm and slurm_local come with pip install 'equirl[launchers]'"
 
 
 def _end(number: int, frame: FrameType | None) -> None:
@@ -116,8 +137,8 @@ def is_multirun() -> bool:
     return HydraConfig.get().mode == RunMode.MULTIRUN
 
 
-def _mendable() -> tuple[type[Exception], ...]:
-    """Errors that say by themselves what the user can do."""
+def mendable() -> tuple[type[Exception], ...]:
+    """Returns the errors that say by themselves what the user can do."""
     from equirl.analysis import TableError
     from equirl.collectors import DemonstrationError
     from equirl.data import DatasetError

@@ -1,6 +1,7 @@
 """The entry points as a user calls them, in processes of their own."""
 
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -17,7 +18,10 @@ _started: list[subprocess.Popen] = []
 
 
 def start(script: str, *arguments: str, **options: Any) -> subprocess.Popen:
-    """Starts a script of ``experiments``, in a folder of no interest unless ``cwd`` says so."""
+    """Starts a script of ``experiments``, in a folder of no interest unless ``cwd`` says so.
+
+    Ctrl-C reaches it also where the tests run in a shell's background, which ignores it.
+    """
     command = [sys.executable, str(ROOT / "experiments" / script), *arguments]
     environment = {key: value for key, value in os.environ.items() if key != "DISPLAY"}
     environment |= {"HOME": "/nonexistent"}  # no wandb login, no caches to rely on
@@ -27,6 +31,7 @@ def start(script: str, *arguments: str, **options: Any) -> subprocess.Popen:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         **{**settings, **options},
     )
     _started.append(process)
@@ -37,9 +42,9 @@ def end_all() -> None:
     """Ends what a test has left running."""
     while _started:
         process = _started.pop()
-        if process.poll() is None:
-            process.kill()
-            process.communicate()
+        process.kill()
+        with process:
+            pass  # closes its pipes
 
 
 def finish(process: subprocess.Popen) -> tuple[int, str, str]:
