@@ -5,7 +5,8 @@
 
 The first argument is the folder to write to; each further one names a group of runs and
 their folders, or is the folder of a sweep, its runs then called by what differs among them.
-Writes ``curves.png``, ``runs.csv`` and ``table.md``.
+Writes ``curves.png``, ``runs.csv`` and ``table.md``. For means over the seeds of a whole sweep
+there is experiments/figures.py.
 """
 
 from __future__ import annotations
@@ -18,8 +19,11 @@ from pathlib import Path
 
 from equirl.analysis import TableError, read_table, wilson_interval
 from equirl.analysis.curves import plot_runs
+from equirl.analysis.labels import differing_keys
+from equirl.analysis.runs import read_runs
+from equirl.analysis.statistics import first_reaching
+from equirl.analysis.summary import SOLVED
 from equirl.analysis.tables import markdown_table, write_table
-from equirl.config import ConfigError, flatten, load_config
 
 #: The tables that are read, and their columns that are.
 NEEDED = {
@@ -74,14 +78,11 @@ def group(text: str) -> list[tuple[str, list[Path]]]:
 
 def labelled(runs: list[Path]) -> list[tuple[str, list[Path]]]:
     """Runs with labels that say in which keys they differ, or their folders' names."""
-    try:
-        configs = [flatten(load_config(run / "config.yaml")) for run in runs]
-    except ConfigError:
-        configs = []
-    keys = [key for key in (configs or [{}])[0] if len({str(each[key]) for each in configs}) > 1]
-    if not keys:
+    configs = [each.keys for run in runs for each in read_runs(run) if each.keys]
+    keys = differing_keys(configs)
+    if not keys or len(configs) < len(runs):
         return [(run.name, [run]) for run in runs]
-    labels = [", ".join(f"{key}={config[key]}" for key in keys) for config in configs]
+    labels = [", ".join(f"{key}={config.get(key)}" for key in keys) for config in configs]
     return [(label, [run]) for label, run in zip(labels, runs, strict=True)]
 
 
@@ -105,8 +106,7 @@ def summary(label: str, folder: Path) -> dict[str, str | int]:
     validation = read_table(folder / "validation.csv") or {"step": [], "success_rate": []}
     successes, episodes = int(sum(test["success"])), len(test["success"])
     low, high = wilson_interval(successes, episodes)
-    pairs = zip(validation["step"], validation["success_rate"], strict=True)
-    first = next((step for step, rate in pairs if rate >= 0.9), None)
+    first = first_reaching(validation["step"], validation["success_rate"], SOLVED)
     minutes = dict(zip(timing["step"], timing["minutes"], strict=True)) if timing else {}
     solved = [n for n, success in zip(test["length"], test["success"], strict=True) if success]
     return {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +28,21 @@ def pyplot() -> Any:
     return plt
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Writes a figure as PNG and forgets it."""
-    figure.savefig(path, dpi=110)
+def save(figure: Figure, path: Path, *, palette: bool = False) -> None:
+    """Writes a figure as PNG and forgets it.
+
+    Args:
+        figure: The figure.
+        path: The file.
+        palette: Whether to keep 255 colours only: a third of the size.
+    """
+    if palette:
+        from PIL import Image
+
+        with BytesIO() as file:
+            figure.savefig(file, dpi=110, format="png")
+            picture = Image.open(file).convert("RGB").quantize(255, dither=Image.Dither.NONE)
+            picture.save(path, optimize=True)
+    else:
+        figure.savefig(path, dpi=110)
     pyplot().close(figure)
