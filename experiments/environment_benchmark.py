@@ -1,4 +1,4 @@
-"""Tables of the environments: speed beside the earlier way, profile, workers and memory.
+"""Tables of the environments: speed beside PyBullet alone and the earlier way, profile, workers.
 
 Speeds of one environment are by processor time, so that what else runs on the machine counts
 little; those of several, by the clock on the wall.
@@ -20,6 +20,7 @@ from unittest import mock
 
 import numpy as np
 import torch
+from bullet_alone import count_simulated, simulate
 from earlier_way import EarlierWay
 from measuring import free_memory, mebibytes, print_header, print_row, ratio
 from torchrl.envs import EnvBase
@@ -74,15 +75,18 @@ def environment(arguments: argparse.Namespace) -> None:
     print(
         f"{arguments.image} x {arguments.image}; an expert acts, its own time in the second column "
         f"alone. The earlier way plays the same scenes and the same actions, in turns, {rounds} "
-        f"rounds; ratios are medians of a round's (smallest to largest). Resets draw new scenes.\n"
+        f"rounds; ratios are medians of a round's (smallest to largest). PyBullet alone makes as "
+        "many simulation steps of the same scenes, the robot at rest, and nothing else: no motors, "
+        "no picture, no tensors. Resets draw new scenes.\n"
     )
+    alone = ("PyBullet alone", "times its time")
     speeds = ("steps/s", "with the expert", "earlier way", "times as fast", "its camera left out")
-    print_header("task", "robot", *speeds, "reset ms", "95 % below")
+    print_header("task", "robot", *speeds, *alone, "reset ms", "95 % below")
     for task in TASKS:
         played = _play_rounds(task, rounds, arguments)
         move, see = (np.array(seconds) for seconds in played.pop("earlier way"))
         for robot, seconds in played.items():
-            step, expert = (np.array(part) for part in seconds)
+            step, expert, simulated = (np.array(part) for part in seconds)
             resets = _resets(task, robot, arguments)
             print_row(
                 task,
@@ -90,6 +94,8 @@ def environment(arguments: argparse.Namespace) -> None:
                 *(f"{1 / np.median(each):.0f}" for each in (step, step + expert)),
                 f"{1 / np.median(move + see):.1f}",
                 *(ratio(each, step) for each in (move + see, move)),
+                f"{1 / np.median(simulated):.0f}",
+                ratio(step, simulated),
                 *(f"{1e3 * np.quantile(resets, level):.1f}" for level in (0.5, 0.95)),
             )
 
@@ -147,23 +153,27 @@ class _Played(NamedTuple):
     step: float  # s, of all steps
     expert: float  # s
     actions: list[np.ndarray]
+    simulated: int  # simulation steps
 
 
 def _play_rounds(task: str, rounds: int, arguments: argparse.Namespace) -> dict[str, Any]:
-    """Returns two lists of seconds a step, one number a round, for each robot and the earlier way.
+    """Returns lists of seconds a step, one number a round, for each robot and the earlier way.
 
-    For our robots those of the steps and of the expert, for the earlier way those of moving and
-    of seeing.
+    For our robots those of the steps, of the expert and of PyBullet alone, for the earlier way
+    those of moving and of seeing.
     """
     source = make_env(task, image_size=16)
     envs = {robot: make_env(task, image_size=arguments.image, robot=robot) for robot in ROBOTS}
     earlier = EarlierWay(source.task, arguments.image, arguments.camera)
-    seconds: dict[str, Any] = {name: ([], []) for name in (*ROBOTS, "earlier way")}
+    seconds: dict[str, Any] = {robot: ([], [], []) for robot in ROBOTS}
+    seconds["earlier way"] = ([], [])
     for number, scene in zip(range(-1, rounds), _scenes(source), strict=False):
         played: dict[str, list[_Played]] = {robot: [] for robot in ROBOTS}
+        alone = dict.fromkeys(ROBOTS, 0.0)
         for _ in range(_TURNS if number >= 0 else 1):
-            for robot in ROBOTS:
-                played[robot].append(_play(envs[robot], scene))
+            for robot, env in envs.items():
+                played[robot].append(_play(env, scene))
+                alone[robot] += simulate(env, scene, played[robot][-1].simulated)
         if number < 0:  # compiled and loaded now
             _replay(earlier, scene, played["panda"][0].actions[:1])
             continue
@@ -171,6 +181,7 @@ def _play_rounds(task: str, rounds: int, arguments: argparse.Namespace) -> dict[
             steps = sum(turn.steps for turn in turns)
             seconds[robot][0].append(sum(turn.step for turn in turns) / steps)
             seconds[robot][1].append(sum(turn.expert for turn in turns) / steps)
+            seconds[robot][2].append(alone[robot] / steps)
         replayed = _replay(earlier, scene, played["panda"][0].actions)
         for mine, part in zip(seconds["earlier way"], replayed, strict=True):
             mine.append(part)
@@ -194,6 +205,7 @@ def _play(env: ManipulationEnv, scene: Scene) -> _Played:
     """Plays an episode with an expert."""
     expert, state = make_expert(env), env.set_scene(scene)
     stepping = planning = 0.0
+    count = count_simulated(env)
     actions: list[np.ndarray] = []
     while not state["done"].item():
         start = time.process_time()
@@ -204,7 +216,7 @@ def _play(env: ManipulationEnv, scene: Scene) -> _Played:
         state = env.step(state)["next"]
         stepping += time.process_time() - begin
         planning += planned - start
-    return _Played(len(actions), stepping, planning, actions)
+    return _Played(len(actions), stepping, planning, actions, next(count))
 
 
 def _replay(earlier: EarlierWay, scene: Scene, actions: list[np.ndarray]) -> tuple[float, float]:
