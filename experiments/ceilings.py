@@ -14,9 +14,8 @@ from functools import partial
 from command_line import at_least
 
 from equirl.analysis.ceilings import DISCOUNT
+from equirl.analysis.labels import TASKS
 from equirl.analysis.tables import markdown_row
-
-TASKS = ("block_picking", "clutter_grasping", "block_pushing", "block_in_bowl")
 
 
 def main(arguments: list[str] | None = None) -> None:

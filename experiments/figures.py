@@ -24,11 +24,8 @@ if TYPE_CHECKING:
 @entry_point("figures", FiguresJob)
 def main(job: FiguresJob) -> None:
     """Draws, and prints the table."""
-    from equirl.analysis.runs import read_runs
-    from equirl.analysis.summary import summarise
-    from equirl.analysis.sweep import collect
-    from equirl.analysis.sweep_curves import plot_sweep
-    from equirl.analysis.tables import write_table
+    from equirl.analysis import collect, plot_sweep, read_runs, summarise, write_table
+    from equirl.analysis.labels import listed
 
     figure = _figure(job.figure)
     folder = Path(job.sweep)
@@ -37,7 +34,8 @@ def main(job: FiguresJob) -> None:
         raise ConfigError(f"sweep={folder}: expected the folder of a sweep or of a run, with runs")
     sweep = collect(runs, figure)
     if not sweep.cells:
-        raise ConfigError(f"sweep={folder}: nothing to draw yet; {'; '.join(sweep.remarks)}")
+        remarks = listed(sweep.remarks, 3, "; ")
+        raise ConfigError(f"sweep={folder}: nothing to draw yet; {remarks}")
     lines = summarise(sweep, window=job.smoothing)
     output = Path(job.output) if job.output else folder
     picture = output / f"figure_{job.figure or 'sweep'}.png"

@@ -10,6 +10,7 @@ Nothing is loaded, locked or written but, on request, a page that opens without 
 from __future__ import annotations
 
 import argparse
+import os
 import shutil
 import sys
 import time
@@ -18,8 +19,8 @@ from pathlib import Path
 
 from command_line import at_least
 
-from equirl.analysis.labels import group_variants, task_name
-from equirl.analysis.runs import Run, find_sweeps, planned_runs
+from equirl.analysis.labels import group_variants, listed, shortened, task_name
+from equirl.analysis.runs import Run, find_sweeps, planned_runs, read_runs
 from equirl.analysis.status import Status, Totals, read_status, total
 
 _HEADINGS = ("run", "what", "state", "step", "return", "success", "steps/min", "left")
@@ -45,16 +46,19 @@ def main(arguments: list[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     if given.html and (given.watch or len(given.folders) > 1):
         parser.error("--html: expected one folder, and no --watch")
-    if given.html:
-        _write_page(given.folders[0], given.html, given.figure, given.embed * 1000)
-        return
     try:
+        if given.html:
+            _write_page(given.folders[0], given.html, given.figure, given.embed * 1000)
+            return
         _show(given.folders)
         while given.watch:
             time.sleep(given.watch)
             _show(given.folders, again=True)
     except KeyboardInterrupt:
         sys.exit(130)
+    except BrokenPipeError:  # a reader such as head has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is still held
+        sys.exit(141)
 
 
 def _show(folders: Sequence[Path], *, again: bool = False) -> None:
@@ -88,8 +92,11 @@ def describe_totals(totals: Totals) -> str:
     if totals.steps:
         parts.append(f"{totals.step:,} of {totals.steps:,} steps made")
     if totals.minutes_left:
-        left = duration(totals.minutes_left / totals.parallel)
-        parts.append(f"{left} left, {_counted(totals.parallel, 'run')} at a time")
+        if totals.parallel:
+            left = duration(totals.minutes_left / totals.parallel)
+            parts.append(f"{left} left, {_counted(totals.parallel, 'run')} at a time")
+        else:
+            parts.append(f"{duration(totals.minutes_left)} of training left, nothing runs")
     return "; ".join(parts)
 
 
@@ -121,11 +128,11 @@ def _rows(statuses: Sequence[Status]) -> Iterator[list[str]]:
         ]
 
 
-def _labels(runs: Sequence[Run]) -> dict[Path, str]:
+def _labels(runs: Sequence[Run], always: Sequence[str] = ()) -> dict[Path, str]:
     """What differs among runs: task, variant, seed; the task also where it is the same."""
     known = [run for run in runs if run.keys]
     labels = dict.fromkeys((run.folder for run in runs), "-")
-    variants = group_variants(known)
+    variants = group_variants(known, always)
     for variant, members in variants.items():
         for run in members:
             parts = [task_name(run.task), variant, f"seed {run.keys.get('seed')}"]
@@ -137,7 +144,7 @@ def _columns(rows: Sequence[Sequence[str]]) -> Iterator[str]:
     """Aligned columns; what is too long for the terminal loses its middle."""
     wide = shutil.get_terminal_size((160, 24)).columns
     most = max(20, wide // 3)
-    short = [[_shortened(row[0], most), row[1], _shortened(row[2], most), *row[3:]] for row in rows]
+    short = [[shortened(row[0], most), row[1], shortened(row[2], most), *row[3:]] for row in rows]
     widths = [max(len(row[column]) for row in short) for column in range(len(_HEADINGS))]
     for row in short:
         texts = [
@@ -145,14 +152,6 @@ def _columns(rows: Sequence[Sequence[str]]) -> Iterator[str]:
             for column, (cell, width) in enumerate(zip(row, widths, strict=True))
         ]
         yield "  " + "  ".join(texts).rstrip()
-
-
-def _shortened(text: str, longest: int) -> str:
-    """A text without its middle: the names of a sweep's runs differ at their ends, too."""
-    if len(text) <= longest:
-        return text
-    half = (longest - 1) // 2
-    return f"{text[:half]}…{text[len(text) - half :]}"
 
 
 def _number(value: float | None, form: str) -> str:
@@ -169,22 +168,24 @@ def _nothing(folders: Sequence[Path]) -> str:
 
 def _write_page(folder: Path, path: Path, figure: str, largest_video: int) -> None:
     from equirl.analysis.page import sweep_page
-    from equirl.analysis.runs import read_runs
     from equirl.analysis.sweep import FIGURES
 
     if figure and figure not in FIGURES:
         sys.exit(f"error: --figure {figure}: expected one of {', '.join(FIGURES)}")
     runs = read_runs(folder)
     if not runs:
-        sys.exit(f"error: {_nothing([folder])}")
+        sweeps = [str(path) for path, _ in find_sweeps(folder)]
+        below = f"{folder} is no sweep; --html takes one of {listed(sweeps, 10)}"
+        sys.exit(f"error: {below if sweeps else _nothing([folder])}")
+    paper = FIGURES.get(figure)
     statuses = [read_status(run) for run in runs]
     summary = describe_totals(total(statuses, planned_runs(folder)))
     page = sweep_page(
         folder,
         statuses,
-        _labels(runs),
+        _labels(runs, [paper.key] if paper else []),
         summary=summary,
-        figure=FIGURES.get(figure),
+        figure=paper,
         base=path.parent,
         largest_video=largest_video,
     )
@@ -193,7 +194,7 @@ def _write_page(folder: Path, path: Path, figure: str, largest_video: int) -> No
         path.write_text(page)
     except OSError as error:
         sys.exit(f"error: cannot write {path}: {error}")
-    print(f"page: {path} ({len(page.encode()) / 1e6:.1f} MB)")
+    print(f"page: {path} ({len(page.encode()) / 1e6:.1f} MB)", flush=True)
 
 
 if __name__ == "__main__":

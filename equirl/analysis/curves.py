@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from equirl.analysis.pictures import COLOURS, pyplot, save
+from equirl.analysis.pictures import COLOURS, plain, pyplot, save
 from equirl.analysis.statistics import moving_return
 from equirl.analysis.tables import read_table
 
@@ -55,14 +55,14 @@ def plot_runs(groups: Mapping[str, Sequence[Path]], path: Path, *, title: str = 
     plt = pyplot()
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
     for colour, (label, folders) in zip(cycle(COLOURS), groups.items(), strict=False):
-        _draw_success(left, folders, label, colour, interval=len(groups) <= 3)
-        _draw_return(right, folders, label, colour)
+        _draw_success(left, folders, plain(label), colour, interval=len(groups) <= 3)
+        _draw_return(right, folders, plain(label), colour)
     handles, labels = left.get_legend_handles_labels()
     if labels:  # none without validations
         widest = max(map(len, labels)) + 7  # letters, with the line before them
         columns = max(1, min(len(labels), _LEGEND_LETTERS // widest))
         figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
-    figure.suptitle(title)
+    figure.suptitle(plain(title))
     save(figure, path)
 
 

@@ -17,8 +17,8 @@ from urllib.parse import quote
 
 import numpy as np
 
-from equirl.analysis.labels import differing_keys, task_name
-from equirl.analysis.runs import METRICS, REPORT, VALIDATION, VIDEO
+from equirl.analysis.labels import differing_keys, listed, task_name
+from equirl.analysis.runs import METRICS, REPORT, VALIDATION, VIDEO, flatten
 from equirl.analysis.statistics import moving_return
 from equirl.analysis.status import Status
 from equirl.analysis.summary import COLUMNS, summarise
@@ -221,7 +221,8 @@ def _environment(folders: Sequence[Path]) -> Iterator[str]:
     for folder in folders:
         try:
             session = json.loads((folder / _RECORD).read_text())["sessions"][-1]
-            records.append(dict(_flat({name: session.get(name) for name in _ENVIRONMENT})))
+            told = flatten({name: session.get(name) for name in _ENVIRONMENT})
+            records.append({name: _joined(value) for name, value in told})
         except (OSError, ValueError, TypeError, LookupError, AttributeError):
             continue  # older than the record, or not begun
     if not records:
@@ -240,20 +241,14 @@ def _values(configs: Sequence[Mapping[str, Any]], name: str) -> str:
         return escape(next(iter(counts)))
     shown = [
         f"{task_name(value) if name == 'env.task' else value} ({count})"
-        for value, count in counts.most_common(12)
+        for value, count in counts.most_common()
     ]
-    more = [f"and {len(counts) - 12} more"] if len(counts) > 12 else []
-    return escape(", ".join([*shown, *more]))
+    return escape(listed(shown, 12))
 
 
-def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in values.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{name}.")
-        elif isinstance(value, list):
-            yield f"{prefix}{name}", ", ".join(map(str, value)) or "none"
-        else:
-            yield f"{prefix}{name}", value
+def _joined(value: object) -> object:
+    """A list in words."""
+    return ", ".join(map(str, value)) or "none" if isinstance(value, list) else value
 
 
 def _table(headings: Iterable[str], rows: Iterable[Iterable[str]]) -> str:

@@ -9,11 +9,17 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["COLOURS", "pyplot", "save"]
+__all__ = ["COLOURS", "DASHES", "plain", "pyplot", "save"]
 
 COLOURS = (
     *("#0b6e99", "#d9730d", "#448361", "#9065b0", "#c14c8a"),
     *("#b3261e", "#5b6770", "#8a6d1f"),
+)
+
+#: Of lines, for further rounds of the colours.
+DASHES: tuple[Any, ...] = (
+    *("-", (0, (4, 1.5)), (0, (1, 1.2))),
+    *((0, (7, 1.5, 1, 1.5)), (0, (3, 1.2, 1, 1.2, 1, 1.2))),
 )
 
 
@@ -26,6 +32,14 @@ def pyplot() -> Any:
 
     plt.rcParams.update({"axes.spines.top": False, "axes.spines.right": False, "font.size": 9})
     return plt
+
+
+def plain(text: str) -> str:
+    """A text as matplotlib is to be given it, whose dollar signs begin no formula.
+
+    Its setting ``text.parse_math`` would take the exponents of logarithmic axes with them.
+    """
+    return text.replace("$", r"\$")
 
 
 def save(figure: Figure, path: Path, *, palette: bool = False) -> None:

@@ -19,6 +19,7 @@ __all__ = [
     "CONFIG",
     "FAILED",
     "LOCK",
+    "LOG",
     "METRICS",
     "REPORT",
     "SWEEP",
@@ -28,12 +29,14 @@ __all__ = [
     "VIDEO",
     "Run",
     "find_sweeps",
+    "flatten",
     "is_run",
+    "natural_order",
     "planned_runs",
     "read_runs",
 ]
 
-CONFIG, LOCK, FAILED = "config.yaml", ".lock", "failed.txt"
+CONFIG, LOCK, LOG, FAILED = "config.yaml", ".lock", "log.txt", "failed.txt"
 METRICS, VALIDATION, TIMING, TEST = "metrics.csv", "validation.csv", "timing.csv", "test.csv"
 REPORT, VIDEO = "report.md", "policy.mp4"
 SWEEP = "multirun.yaml"  # Hydra's, in the folder of a sweep
@@ -91,8 +94,8 @@ def read_runs(folder: Path) -> list[Run]:
         return [_read_run(folder)]
     if not folder.is_dir():
         return []
-    below = [path.name for path in folder.iterdir() if path.is_dir() and is_run(path)]
-    return [_read_run(folder / name) for name in sorted(below, key=_natural)]
+    below = [path.name for path in folder.iterdir() if path.is_dir() and _is_shown(path)]
+    return [_read_run(folder / name) for name in sorted(below, key=natural_order)]
 
 
 def find_sweeps(folder: Path) -> Iterator[tuple[Path, list[Run]]]:
@@ -105,7 +108,7 @@ def find_sweeps(folder: Path) -> Iterator[tuple[Path, list[Run]]]:
         yield folder.parent, read_runs(folder)
         return
     for path, names, _ in os.walk(folder):
-        runs = sorted((name for name in names if is_run(Path(path, name))), key=_natural)
+        runs = sorted((name for name in names if _is_shown(Path(path, name))), key=natural_order)
         # Nothing of ours is inside a run, but trackers keep thousands of files there.
         names[:] = sorted(name for name in set(names) - set(runs) if not name.startswith("."))
         if runs:
@@ -127,8 +130,13 @@ def planned_runs(folder: Path) -> int | None:
         return None
 
 
-def _natural(name: str) -> list[tuple[int, str]]:
-    """Numbers in names by value: ``copies-2`` before ``copies-16``."""
+def _is_shown(folder: Path) -> bool:
+    """Whether a folder that nobody named is listed: Hydra's ``.hydra`` looks like a run."""
+    return not folder.name.startswith(".") and is_run(folder)
+
+
+def natural_order(name: str) -> list[tuple[int, str]]:
+    """A key for sorting, with numbers in names by value: ``copies-2`` before ``copies-16``."""
     return [(int(part), "") if part.isdecimal() else (0, part) for part in _NUMBER.split(name)]
 
 
@@ -166,12 +174,21 @@ def _read_run(folder: Path) -> Run:
         return Run(folder, damage=f"{path} is not a readable configuration: {reason}")
     if not isinstance(values, dict):
         return Run(folder, damage=f"{path} is not a configuration: expected keys and values")
-    return Run(folder, dict(_flat(values)))
+    return Run(folder, dict(flatten(values)))
 
 
-def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The values of nested mappings, under names such as ``"env.task"``.
+
+    Args:
+        values: Mappings, and anything else as their values.
+        prefix: Of all names.
+
+    Yields:
+        A name and its value.
+    """
     for name, value in values.items():
         if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{name}.")
+            yield from flatten(value, f"{prefix}{name}.")
         else:
             yield f"{prefix}{name}", value

@@ -61,8 +61,9 @@ class Totals:
         step: Steps made.
         steps: Steps to make, by the runs that have begun.
         minutes_left: Of all planned runs, one after the other, at the speed of those there are;
-            None when none has a speed.
-        parallel: Runs at present, at least 1.
+            while some run, without those that have failed, which their command passes by. None
+            when none has a speed.
+        parallel: Runs at present.
     """
 
     counts: dict[str, int]
@@ -91,7 +92,8 @@ def read_status(run: Run) -> Status:
         state = "running"
     elif finished:
         state, step = "finished", max(step, run.steps)
-        played = [row["success"] for row in _last_rows(run.folder / TEST) if "success" in row]
+        rows = _last_rows(run.folder / TEST, tail=None)
+        played = [row["success"] for row in rows if "success" in row]
         success = sum(played) / len(played) if played else success
     elif (run.folder / FAILED).exists() or run.damage:
         state, reason = "failed", _reason(run.folder / FAILED) or run.damage
@@ -117,22 +119,24 @@ def total(statuses: Sequence[Status], planned: int | None = None) -> Totals:
     """
     known = [status.state for status in statuses]
     begun = [status for status in statuses if status.run.steps]
+    running = known.count("running")
+    lost = known.count("failed") if running else 0
+    tried = [status for status in begun if not (lost and status.state == "failed")]
     steps = sum(status.run.steps for status in begun)
     planned = max(planned or 0, len(statuses))
     speeds = [status.speed for status in begun if status.speed]
     mean = sum(speeds) / len(speeds) if speeds else None
     left = None
     if mean and begun:
-        own = [max(each.run.steps - each.step, 0) / (each.speed or mean) for each in begun]
-        others = (planned - len(begun)) * (steps / len(begun)) / mean
-        left = sum(own) + others
+        own = [max(each.run.steps - each.step, 0) / (each.speed or mean) for each in tried]
+        left = sum(own) + (planned - lost - len(tried)) * (steps / len(begun)) / mean
     return Totals(
         {state: known.count(state) for state in STATES if state in known},
         planned,
         sum(status.step for status in begun),
         steps,
         left,
-        max(known.count("running"), 1),
+        running,
     )
 
 
@@ -179,13 +183,13 @@ def _speed(timing: Sequence[dict[str, float]]) -> float | None:
     return (rows[-1]["step"] - first["step"]) / minutes if minutes > 0 else None
 
 
-def _last_rows(path: Path) -> list[dict[str, float]]:
-    """The whole rows at the end of a table; one that is no table has none."""
+def _last_rows(path: Path, tail: int | None = _TAIL) -> list[dict[str, float]]:
+    """The whole rows in the last bytes of a table, or all; one that is no table has none."""
     try:
         with open(path, "rb") as file:
             names = file.readline().decode(errors="replace").strip().split(",")
             begin = file.tell()
-            cut = max(begin, os.fstat(file.fileno()).st_size - _TAIL)
+            cut = begin if tail is None else max(begin, os.fstat(file.fileno()).st_size - tail)
             file.seek(cut)
             lines = file.read().decode(errors="replace").split("\n")[:-1]
     except OSError:

@@ -89,8 +89,8 @@ class Summary:
 def summarise(sweep: Sweep, *, window: int = 500) -> list[Summary]:
     """The lines of the table: each variant on each task, then on all if there are several.
 
-    A line over all tasks needs a finished run of each, or the tasks left would make it look
-    better or worse than it is.
+    A line over all tasks needs equally many finished runs of each, or the tasks that have more of
+    them would make it look better or worse than it is.
 
     Args:
         sweep: Its runs.
@@ -105,7 +105,8 @@ def summarise(sweep: Sweep, *, window: int = 500) -> list[Summary]:
     if len(sweep.tasks) > 1:
         for variant in sweep.variants:
             own = [line for line in lines if line.variant == variant]
-            if len(own) == len(sweep.tasks) and all(line.finished for line in own):
+            even = len(own) == len(sweep.tasks) and len({line.finished for line in own}) == 1
+            if even and own[0].finished:
                 lines.append(_on_all(sweep, variant, own))
     return lines
 

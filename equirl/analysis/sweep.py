@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from equirl.analysis.labels import group_variants, task_name, variant_label
+from equirl.analysis.labels import TASKS, between_tasks, group_variants, task_name, variant_label
+from equirl.analysis.pictures import COLOURS, DASHES
 from equirl.analysis.runs import METRICS, TEST, VALIDATION, Run
 from equirl.analysis.statistics import mean_and_error, moving_return
 from equirl.analysis.tables import TableError, read_table
@@ -70,7 +71,8 @@ class RunTables:
         returns: Its discounted return, shape (E,).
         validation_steps: Steps of the validations, shape (V,).
         validation_success: Their success rates, shape (V,).
-        test_success: Success rate on the test scenes; None before they are played.
+        test_success: Success rate on the test scenes; None before they are played, or if their
+            table is damaged.
     """
 
     run: Run
@@ -149,16 +151,13 @@ class Sweep:
         tables = self.cells.get((task, variant), ())
         if not tables:
             return None
-        shared = set.intersection(*(set(each.validation_steps) for each in tables))
-        rows = [
-            [
-                rate
-                for step, rate in zip(each.validation_steps, each.validation_success, strict=True)
-                if step in shared
-            ]
+        # Of a step that stands twice, the later rate.
+        rates = [
+            dict(zip(each.validation_steps, each.validation_success, strict=True))
             for each in tables
         ]
-        return _curve(np.array(sorted(shared)), np.array(rows))
+        shared = sorted(set.intersection(*map(set, rates)))
+        return _curve(np.array(shared), np.array([[own[step] for step in shared] for own in rates]))
 
     def success_ahead(self, task: str, variant: str) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """What `success` leaves out: of each run, from the last validation that all have.
@@ -188,26 +187,19 @@ def collect(runs: Sequence[Run], figure: Figure | None = None) -> Sweep:
 
     Args:
         runs: Those of a sweep.
-        figure: The figure of the paper they are for: says which variants are missing.
+        figure: The figure of the paper they are for: what its variants are called, even while
+            one alone has begun, and which are missing.
     """
-    remarks: list[str] = []
+    remarks = [run.damage or f"{run.name}: not begun" for run in runs if not run.keys]
     cells: dict[tuple[str, str], list[RunTables]] = {}
     known = [run for run in runs if run.keys]
-    for run in runs:
-        if not run.keys:
-            remarks.append(run.damage or f"{run.name}: not begun")
-    for variant, members in group_variants(known).items():
+    variants = group_variants(known, [figure.key] if figure else [])
+    for variant, members in variants.items():
         begun: dict[tuple[str, int], list[RunTables]] = {}
         for run in sorted(members, key=lambda run: (_task_place((run.task, "")), _seed(run))):
-            try:
-                tables = _read(run)
-            except TableError as error:
-                remarks.append(f"{error}: the run is left out")
-                continue
-            if not len(tables.steps):
-                remarks.append(f"{run.name}: no episode has ended, left out")
-                continue
-            begun.setdefault((run.task, _seed(run)), []).append(tables)
+            tables = _read(run, remarks)
+            if tables:
+                begun.setdefault((run.task, _seed(run)), []).append(tables)
         for (task, seed), repeated in begun.items():
             # Of two that are as far, the finished one.
             kept = max(repeated, key=lambda each: (each.end, each.test_success is not None))
@@ -221,18 +213,31 @@ def collect(runs: Sequence[Run], figure: Figure | None = None) -> Sweep:
                 elif each.test_success is None:
                     at = f"at step {each.steps[-1]:.0f}"
                     remarks.append(f"{each.run.name}: unfinished, {at} of {each.run.steps}")
-    return Sweep(cells, [*remarks, *_missing(known, figure)])
+    missing, uneven = _missing(known, variants, figure), between_tasks(variants)
+    return Sweep(cells, [*remarks, *missing, *uneven, *_too_many(cells)])
 
 
-def _read(run: Run) -> RunTables:
-    metrics = read_table(run.folder / METRICS, ["step", "discounted_return"])
-    validation = read_table(run.folder / VALIDATION, ["step", "success_rate"])
-    test = read_table(run.folder / TEST, ["success"]) if run.is_finished else {}
+def _read(run: Run, remarks: list[str]) -> RunTables | None:
+    """The tables of a run; what is damaged is left out and told in a remark."""
+    try:
+        metrics = read_table(run.folder / METRICS, ["step", "discounted_return"])
+        validation = read_table(run.folder / VALIDATION, ["step", "success_rate"])
+    except TableError as error:
+        remarks.append(f"{error}: the run is left out")
+        return None
+    if not metrics:
+        remarks.append(f"{run.name}: no episode has ended, left out")
+        return None
+    try:
+        test = read_table(run.folder / TEST, ["success"]) if run.is_finished else {}
+    except TableError as error:
+        remarks.append(f"{error}: the run counts as unfinished")
+        test = {}
     success = test.get("success", [])
     return RunTables(
         run,
-        np.array(metrics.get("step", []), dtype=float),
-        np.array(metrics.get("discounted_return", []), dtype=float),
+        np.array(metrics["step"], dtype=float),
+        np.array(metrics["discounted_return"], dtype=float),
         np.array(validation.get("step", []), dtype=float),
         np.array(validation.get("success_rate", []), dtype=float),
         sum(success) / len(success) if success else None,
@@ -254,12 +259,23 @@ def _curve(steps: np.ndarray, rows: np.ndarray) -> Curve | None:
     return Curve(steps[whole], mean, error, len(rows))
 
 
-def _missing(runs: Sequence[Run], figure: Figure | None) -> list[str]:
+def _too_many(cells: Iterable[tuple[str, str]]) -> list[str]:
+    """What a figure of more variants than there are kinds of lines asks its reader to bear."""
+    count, kinds = len({variant for _, variant in cells}), len(COLOURS) * len(DASHES)
+    if count <= kinds:
+        return []
+    return [f"{count} variants: from {kinds + 1} on their lines look as those from 1 on"]
+
+
+def _missing(
+    runs: Sequence[Run], variants: Mapping[str, Sequence[Run]], figure: Figure | None
+) -> list[str]:
     """What the tasks and seeds that have begun lack to be even."""
     seeds = sorted({_seed(run) for run in runs})
     lacking: dict[str, list[str]] = {}
+    expected = _expected(runs, variants, figure)
     for task in dict.fromkeys(run.task for run in runs):
-        for variant, members in _expected(runs, figure).items():
+        for variant, members in expected.items():
             there = {_seed(run) for run in members if run.task == task}
             absent = [str(seed) for seed in seeds if seed not in there]
             if absent:
@@ -271,9 +287,11 @@ def _missing(runs: Sequence[Run], figure: Figure | None) -> list[str]:
     ]
 
 
-def _expected(runs: Sequence[Run], figure: Figure | None) -> dict[str, list[Run]]:
+def _expected(
+    runs: Sequence[Run], variants: Mapping[str, Sequence[Run]], figure: Figure | None
+) -> dict[str, Sequence[Run]]:
     """Runs by variant, without any for variants of the figure that have not begun."""
-    grouped = group_variants(runs)
+    grouped = dict(variants)
     if figure and runs:
         begun = {str(run.keys.get(figure.key)) for run in runs}
         for value in figure.values:
@@ -288,10 +306,7 @@ def _seed(run: Run) -> int:
     return seed if isinstance(seed, int) else 0
 
 
-_TASKS = ("block_picking", "clutter_grasping", "block_pushing", "block_in_bowl")
-
-
 def _task_place(cell: tuple[str, str]) -> tuple[int, str]:
     """The paper's order of tasks, others after them."""
     task = cell[0]
-    return (_TASKS.index(task) if task in _TASKS else len(_TASKS)), task
+    return (TASKS.index(task) if task in TASKS else len(TASKS)), task

@@ -4,51 +4,77 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from equirl.analysis.ceilings import expert_ceiling
-from equirl.analysis.labels import task_name
-from equirl.analysis.pictures import COLOURS, pyplot, save
+from equirl.analysis.labels import shortened, task_name
+from equirl.analysis.pictures import COLOURS, DASHES, plain, pyplot, save
 from equirl.analysis.summary import ALL_TASKS, Summary, summarise
 from equirl.analysis.sweep import Curve, Sweep
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
-__all__ = ["plot_sweep"]
+__all__ = ["draw_sweep", "plot_sweep"]
 
 _CEILING: dict[str, Any] = {"color": "#5b6770", "lw": 1, "ls": (0, (5, 3))}
 
+_LABEL_LETTERS = 90  # of a variant, in the legend
+_LEGEND_LETTERS = 46  # as wide as a panel
+_TITLE_LETTERS = 11  # an inch
+
 
 def plot_sweep(sweep: Sweep, path: Path, *, title: str = "", window: int = 500) -> None:
-    """Draws a column a task: behaviour return above, greedy success below; at the right, IQM.
-
-    Lines are means over runs where all of them have data, thin ones single runs that are
-    further than others; shading is the standard error, the dashed line what the expert earns.
+    """Writes what `draw_sweep` draws.
 
     Args:
         sweep: With at least one run.
         path: The PNG file to write.
         title: Above the figure.
         window: Steps that a return is averaged over.
-    """
-    from matplotlib.lines import Line2D
 
-    tasks, variants = sweep.tasks, sweep.variants
+    Raises:
+        OSError: The file cannot be written.
+    """
+    save(draw_sweep(sweep, title=title, window=window), path, palette=True)
+
+
+def draw_sweep(sweep: Sweep, *, title: str = "", window: int = 500) -> Figure:
+    """Draws a column a task: behaviour return above, greedy success below; at the right, IQM.
+
+    Lines are means over runs where all of them have data, thin ones single runs that are
+    further than others; shading is the standard error, the dashed line what the expert earns.
+    Several variants are numbered, in the legend and at the rows of the IQM.
+
+    Args:
+        sweep: With at least one run.
+        title: Above the figure.
+        window: Steps that a return is averaged over.
+
+    Returns:
+        The figure, which stays open until `matplotlib.pyplot.close`.
+    """
+    tasks, styles = sweep.tasks, _styles(sweep.variants)
     final = _final(summarise(sweep, window=window), len(tasks))
     single = len(tasks) == 1
     widths = [1.0] * (2 if single else len(tasks)) + [0.8] * bool(final)
-    labels = {each: f"{each} ({_seeds(sweep, each)})" for each in variants}
-    columns = _columns(list(labels.values()), sum(widths))
-    height = max(2.9 if single else 5.2, 0.24 * len(variants)) + 0.2 * -(-len(labels) // columns)
-    figure = pyplot().figure(figsize=(3.1 * sum(widths) + 0.8, height), layout="constrained")
+    entries = _entries(sweep, styles, sum(widths))
+    columns = _columns([label for label, _ in entries], sum(widths))
+    wide = 3.1 * sum(widths) + 0.8
+    heading = ", ".join(filter(None, [title, task_name(tasks[0]) if single else ""]))
+    lines = wrap(heading, int(_TITLE_LETTERS * wide), max_lines=3, placeholder=" …")
+    height = max(2.9 if single else 5.2, 0.24 * len(styles)) + 0.2 * -(-len(entries) // columns)
+    figure = pyplot().figure(figsize=(wide, height + 0.17 * len(lines)), layout="constrained")
     grid = figure.add_gridspec(1 if single else 2, len(widths), width_ratios=widths)
     for column, task in enumerate(tasks):
         above = figure.add_subplot(grid[0, column])
         below = figure.add_subplot(grid[0, 1] if single else grid[1, column])
-        for variant, style in _styles(variants).items():
+        for variant, style in styles.items():
             _draw(above, sweep.returns(task, variant, window), style)
             _draw_ahead(above, sweep.ahead(task, variant, window), style)
             _draw(below, sweep.success(task, variant), style, marker=True)
@@ -57,33 +83,49 @@ def plot_sweep(sweep: Sweep, path: Path, *, title: str = "", window: int = 500) 
         for axes in (above, below):
             axes.set_xlim(0, _last_step(sweep, task))
         if not single:
-            above.set_title(task_name(task))
+            above.set_title(plain(shortened(task_name(task), 34)))
         _finish(above, below, f"return, previous {window} steps", first=column == 0, single=single)
     if final:
-        _draw_intervals(figure.add_subplot(grid[:, -1]), final, _styles(variants))
-    lines = {
-        labels[each]: Line2D([], [], lw=1.8, **style) for each, style in _styles(variants).items()
-    }
-    if any(_ceilings(sweep, task) for task in tasks):
-        lines["expert"] = Line2D([], [], **_CEILING)
+        _draw_intervals(figure.add_subplot(grid[:, -1]), final, styles)
     figure.legend(
-        lines.values(),
-        lines,
+        [handle for _, handle in entries],
+        [plain(label) for label, _ in entries],
         loc="outside lower center",
-        ncols=_columns(list(lines), sum(widths)),
+        ncols=columns,
         frameon=False,
+        handlelength=2.6,  # of each dash pattern a whole one
     )
-    figure.suptitle(", ".join(filter(None, [title, task_name(tasks[0]) if single else ""])))
-    save(figure, path, palette=True)
+    figure.suptitle(plain("\n".join(lines)))
+    return figure
 
 
 def _styles(variants: Sequence[str]) -> dict[str, dict[str, Any]]:
     """A colour for each variant; further rounds of the colours are dashed and dotted."""
     count = len(COLOURS)
     return {
-        variant: {"color": COLOURS[n % count], "ls": ("-", "--", ":")[n // count % 3]}
+        variant: {"color": COLOURS[n % count], "ls": DASHES[n // count % len(DASHES)]}
         for n, variant in enumerate(variants)
     }
+
+
+def _entries(
+    sweep: Sweep, styles: Mapping[str, dict[str, Any]], width: float
+) -> list[tuple[str, Line2D]]:
+    """The legend below so many panels: labels that fit, and their lines."""
+    from matplotlib.lines import Line2D
+
+    longest = min(_LABEL_LETTERS, int(_LEGEND_LETTERS * width) - 25)
+    entries = []
+    for number, (variant, style) in enumerate(styles.items(), start=1):
+        label = f"{shortened(variant, longest)} ({_seeds(sweep, variant)})"
+        entries.append((_numbered(number, label, styles), Line2D([], [], lw=1.8, **style)))
+    if any(_ceilings(sweep, task) for task in sweep.tasks):
+        entries.append(("expert", Line2D([], [], **_CEILING)))
+    return entries
+
+
+def _numbered(number: int, label: str, styles: Mapping[str, object]) -> str:
+    return f"{number} {label}" if len(styles) > 1 else label
 
 
 def _final(lines: Sequence[Summary], tasks: int) -> list[Summary]:
@@ -148,13 +190,14 @@ def _draw_intervals(
         low, high = (line.low, line.high) if line.low == line.low else (line.iqm, line.iqm)
         axes.barh(place, high - low, 0.5, left=low, color=colour, alpha=0.35)
         axes.plot([line.iqm] * 2, [place - 0.25, place + 0.25], color=colour, lw=2.5)
-        # Beside the bar, where there is room.
-        at, side = (low - 0.03, "right") if high > 0.8 else (high + 0.03, "left")
-        axes.text(at, place, f"{line.iqm:.0%}", ha=side, va="center", fontsize=8)
+        axes.text(high + 0.03, place, f"{line.iqm:.0%}", va="center", fontsize=8)
     rows = max(len(styles), 5)  # a few bars are no wider than many
     middle = (1 - len(styles)) / 2
-    axes.set(xlim=(-0.06, 1.06), ylim=(middle - rows / 2, middle + rows / 2))
-    axes.set_yticks([])
+    axes.set(xlim=(-0.06, 1.26), ylim=(middle - rows / 2, middle + rows / 2))
+    axes.set_xticks([0, 0.25, 0.5, 0.75, 1])  # right of them there is room for the numbers
+    numbers = [_numbered(number, "", styles).strip() for number in range(1, len(styles) + 1)]
+    axes.set_yticks(list(places.values()), numbers)
+    axes.tick_params(axis="y", length=0)
     axes.grid(axis="x", alpha=0.25, lw=0.5)
     axes.spines["left"].set_visible(False)
     axes.set_title("success on test scenes")
@@ -177,8 +220,8 @@ def _seeds(sweep: Sweep, variant: str) -> str:
 
 
 def _columns(labels: Sequence[str], width: float) -> int:
-    """Columns of a legend that fit below so many panels, about 46 letters each; even rows."""
+    """Columns of a legend that fit below so many panels; even rows."""
     longest = max(map(len, labels)) + 12
-    most = max(1, min(len(labels), int(46 * width / longest)))
+    most = max(1, min(len(labels), int(_LEGEND_LETTERS * width / longest)))
     rows = -(-len(labels) // most)
     return -(-len(labels) // rows)

@@ -30,7 +30,7 @@ def read_table(path: Path, needed: Sequence[str] = ()) -> dict[str, list[float]]
         needed: Columns that a table with rows must have.
 
     Raises:
-        TableError: The file is not such a table.
+        TableError: The file is not such a table, or cannot be read.
     """
     rows = read_rows(path)
     missing = [name for name in needed if rows and name not in rows[0]]
@@ -43,12 +43,14 @@ def read_rows(path: Path) -> list[dict[str, float]]:
     """Reads what `read_table` reads, as rows.
 
     Raises:
-        TableError: The file is not such a table.
+        TableError: The file is not such a table, or cannot be read.
     """
-    if not path.exists():
-        return []
     try:
         text = path.read_text()
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    except OSError as error:
+        raise TableError(f"{path} cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:
         raise TableError(f"{path} is no table: {error}") from None
     header, *lines = [line for line in text.splitlines(True) if line.endswith("\n")] or [""]
@@ -99,4 +101,5 @@ def markdown_table(columns: Iterable[object], rows: Iterable[Iterable[object]]) 
 
 def markdown_row(cells: Iterable[object]) -> str:
     """Returns a row of a table in Markdown, for tables that are printed as they grow."""
-    return f"| {' | '.join(map(str, cells))} |"
+    texts = (str(cell).replace("|", r"\|") for cell in cells)
+    return f"| {' | '.join(texts)} |"

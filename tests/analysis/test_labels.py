@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from equirl.analysis.labels import differing_keys, group_variants, task_name
+from equirl.analysis.labels import differing_keys, group_variants, listed, shortened, task_name
 from equirl.analysis.runs import Run
 from equirl.config import Config, flatten
 from equirl.config.schema import is_execution, is_free
@@ -38,6 +38,9 @@ def labels(*changes):
         ("augmentation.copies", [16, 4, 0, 1], ["no augmentation", "1 copy", "4 copies", "16 co"]),
         ("demos.episodes", [10, 0], ["no demonstrations", "10 demonstrations"]),
         ("group", ["O2", "D8", "SO2", "C4"], ["C4", "D8", "SO(2)", "O(2)"]),
+        ("group", ["O2", "D12", "C10", "C6", "C12"], ["C6", "C10", "C12", "D12", "O(2)"]),
+        ("group", ["D2", "C3", "C8", "C4"], ["C3", "C4", "C8", "D2"]),
+        ("demos.file", ["of-10", "of-9"], ["demos.file=of-9", "demos.file=of-10"]),
         ("method.name", ["ferm", "drq", "cnn"], ["CNN SAC", "DrQ SAC", "FERM SAC"]),
         ("algorithm.name", ["sacfd", "sac"], ["Equivariant SAC", "Equivariant SACfD"]),
         ("mode", ["paper", "strict"], ["mode=paper", "mode=strict"]),
@@ -85,6 +88,46 @@ def test_a_key_that_goes_with_another_or_with_the_task_is_not_mentioned():
     other = {"env.task": "block_in_bowl", "env.max_steps": 80}
     assert list(labels(other, {}, {"mode": "paper"})) == ["mode=paper", "mode=strict"]
     assert len(labels(other, {})) == 1
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("augmentation.copies", 0), ("group", "C4"), ("demos.episodes", 10)]
+)
+def test_what_the_paper_varies_makes_variants_across_tasks_too(key, value):
+    assert len(labels({}, {"env.task": "block_pushing", key: value})) == 2
+
+
+def test_the_usual_value_of_a_key_without_words_is_not_told():
+    odd = {"algorithm.critics": 5}, {"augmentation.quarter_turns": True}
+    usual = {"algorithm.critics": 2, "augmentation.quarter_turns": False}
+    changes = [usual | change for change in ({}, {"group": "C4"}, {"group": "C8"}, *odd)]
+    assert sorted(labels(*changes)) == [
+        *("C4", "C8", "D4", "D4, algorithm.critics=5", "D4, augmentation.quarter_turns=True")
+    ]
+    alone = [{"algorithm.critics": 2, "seed": 1}, {"algorithm.critics": 2}, *odd[:1]]
+    assert list(labels(*alone)) == ["algorithm.critics=2", "algorithm.critics=5"]
+    even = [
+        {"group": group, "mode": mode} for group in ("C4", "D4") for mode in ("paper", "strict")
+    ]
+    assert [*labels(*even)][:2] == ["C4, mode=paper", "C4, mode=strict"]
+
+
+def test_runs_of_one_label_are_never_trained_differently():
+    """Augmentations that are equal have one label, with which no other key may go."""
+    none, zero = {"augmentation.name": "none"}, {"augmentation.copies": 0, "mode": "paper"}
+    found = labels(none, zero, {})
+    assert list(found) == ["no augmentation", "no augmentation, mode=paper", "4 copies"]
+
+
+def test_a_key_is_told_that_will_differ():
+    runs = [Run(Path("0"), BASE)]
+    assert list(group_variants(runs, ["augmentation.copies"])) == ["4 copies"]
+
+
+def test_texts_that_are_too_long_for_a_line():
+    assert shortened("abcdefgh", 8) == "abcdefgh" and shortened("abcdefghi", 8) == "abc…ghi"
+    assert listed(["a", "b", "c"], 3, "; ") == "a; b; c"
+    assert listed(["a", "b", "c", "d", "e"], 3, "; ") == "a; b; c; and 2 more"
 
 
 def test_two_keys_are_both_told_and_equal_augmentations_are_one():

@@ -122,7 +122,11 @@ def test_each_run_has_its_curves(sweep):
 
 
 def test_configuration_and_environment(sweep):
+    (sweep / "copies#0" / "run.json").write_text(
+        '{"sessions": [{"versions": {"torch": "2"}, "machine": {"cores": 2, "gpus": ["x", "y"]}}]}'
+    )
     text = " ".join(Page(page_of(sweep)).text)
+    assert "machine.gpus x, y (1), - (1)" in text
     assert "seed 0 (1), 1 (1), 2 (1)" in text and "keys that are the same in all runs" in text
     assert "Of 2 runs, in the last session of each" in text
     assert "machine.cores 2 (1), 3 (1)" in text and "versions.torch 2 " in text

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from equirl import analysis
 from equirl.analysis import moving_return, wilson_interval
 from equirl.analysis.statistics import (
     first_reaching,
@@ -96,6 +97,12 @@ def test_the_interval_covers_the_true_mean_about_as_often_as_it_says():
         ]
     ]
     assert 0.85 <= np.mean(covered) <= 0.97
+
+
+def test_what_a_sweep_is_read_and_drawn_with_is_public():
+    """And so in the reference, which is made of what the package lists."""
+    names = {"read_runs", "collect", "summarise", "draw_sweep", "plot_sweep"}
+    assert names | {"interquartile_mean", "stratified_interval"} <= set(analysis.__all__)
 
 
 def test_first_reaching():

@@ -98,10 +98,33 @@ def test_totals(tmp_path):
     statuses = [read_status(run) for run in read_runs(tmp_path)]
     totals = total(statuses, planned=4)
     assert totals.counts == {"finished": 1, "stopped": 1} and totals.planned == 4
-    assert (totals.step, totals.steps, totals.parallel) == (500, 800, 1)
+    assert (totals.step, totals.steps, totals.parallel) == (500, 800, 0)
     # 300 steps of b and twice 400 of those to come, 50 a minute.
     assert totals.minutes_left == pytest.approx(22)
     assert total([]).minutes_left is None and total(statuses[:1]).minutes_left == 0
+
+
+def test_failed_runs_are_left_to_a_command_that_is_given_again(tmp_path):
+    write_run(tmp_path / "a", returns=[0.1], success=[0.1], test=None)
+    for name in ("b", "c"):
+        write_run(tmp_path / name, returns=[0.1], success=[0.1], test=None)
+        (tmp_path / name / "failed.txt").write_text("no memory\n")
+    (tmp_path / "c" / "config.yaml").unlink()  # it failed before it had one
+
+    def totals():
+        return total([read_status(run) for run in read_runs(tmp_path)], planned=4)
+
+    # 300 steps each of a and b, 400 each of c and of the one to come, 50 a minute.
+    assert (totals().minutes_left, totals().parallel) == (pytest.approx(28), 0)
+    with claim_folder(tmp_path / "a"):
+        assert (totals().minutes_left, totals().parallel) == (pytest.approx(14), 1)
+        with claim_folder(tmp_path / "b"):  # it is tried again
+            assert (totals().minutes_left, totals().parallel) == (pytest.approx(20), 2)
+
+
+def test_all_test_scenes_count_however_many(tmp_path):
+    status = status_of(write_run(tmp_path / "a", test=[0] * 30_000 + [1] * 10_000))
+    assert status.success == 0.25
 
 
 def test_sweeps_are_found_by_folder_and_runs_are_not_searched(tmp_path):
@@ -109,6 +132,8 @@ def test_sweeps_are_found_by_folder_and_runs_are_not_searched(tmp_path):
     write_run(tmp_path / "one" / "b")
     write_run(tmp_path / "one" / "b" / "wandb" / "config")
     write_run(tmp_path / ".hidden" / "c")
+    write_run(tmp_path / ".hydra")
+    write_run(tmp_path / "one" / ".hydra")
     found = [(path.name, [run.name for run in runs]) for path, runs in find_sweeps(tmp_path)]
     assert found == [("one", ["b"]), ("sweep", ["a"])]
     assert [run.name for _, runs in find_sweeps(tmp_path / "one" / "b") for run in runs] == ["b"]

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from equirl.analysis.ceilings import CEILINGS, expert_ceiling
+from equirl.analysis.labels import TASKS
 from equirl.analysis.runs import planned_runs, read_runs
 from equirl.analysis.summary import summarise
 from equirl.analysis.sweep import FIGURES, collect
@@ -142,6 +143,41 @@ def test_no_line_over_all_tasks_while_one_has_no_finished_run(tmp_path):
     }  # fmt: skip
 
 
+def test_no_line_over_all_tasks_while_one_has_more_finished_runs(tmp_path):
+    """Four runs of picking at 100 % and one each of the others at 0 % would have an IQM of 60 %."""
+    tasks = ("block_pushing", "block_in_bowl", "clutter_grasping")
+    for seed in range(4):
+        write_run(tmp_path / f"p{seed}", seed=seed, test=[1])
+        for task in tasks:
+            test = [0] if seed == 0 else None
+            write_run(tmp_path / f"{task}{seed}", seed=seed, env_task=task, test=test)
+    assert "all tasks" not in {line.task for line in summarise(collect(read_runs(tmp_path)))}
+    for folder in tmp_path.glob("*[123]"):
+        (folder / "report.md").unlink(missing_ok=True)
+    *_, both = summarise(collect(read_runs(tmp_path)))
+    assert (both.task, both.finished, both.success, both.iqm) == ("all tasks", 4, 0.25, 0.0)
+
+
+def test_what_differs_between_tasks_only_is_told(tmp_path):
+    write_run(tmp_path / "a", env_max_steps=80, env_task="block_in_bowl", threads=1)
+    for group in ("C4", "D4"):
+        write_run(tmp_path / group, group=group, threads=2)
+    sweep = collect(read_runs(tmp_path))
+    assert sweep.variants == ["C4", "D4"] and sweep.remarks == [
+        "missing: Block in Bowl, C4, seed 0",
+        "env.max_steps differs between tasks: 50 for Block Picking, 80 for Block in Bowl",
+    ]
+
+
+def test_a_figure_calls_its_variants_by_its_key_from_the_first_on(tmp_path):
+    write_run(tmp_path / "a", augmentation_copies=0)
+    assert collect(read_runs(tmp_path)).variants == [LABEL]
+    sweep = collect(read_runs(tmp_path), FIGURES["12"])
+    assert sweep.variants == ["no augmentation"]
+    assert sweep.remarks[0] == "missing: Block Picking, 2 copies, seed 0"
+    assert len(sweep.remarks) == 4
+
+
 def test_what_is_missing_is_told(tmp_path):
     for copies, seed in [(0, 0), (0, 1), (4, 0)]:
         write_run(tmp_path / f"{copies}-{seed}", augmentation_copies=copies, seed=seed)
@@ -173,6 +209,42 @@ def test_damaged_and_cut_tables(tmp_path):
     assert f"{damaged / 'metrics.csv'}, line 6: expected numbers" in table and "left out" in table
     assert "c/config.yaml is not a readable configuration" in unreadable
     assert none == "d: no episode has ended, left out"
+
+
+def test_a_table_that_cannot_be_read_leaves_its_run_out(tmp_path):
+    folder = write_run(tmp_path / "a")
+    (folder / "metrics.csv").unlink()
+    (folder / "metrics.csv").mkdir()
+    write_run(tmp_path / "b", seed=1)
+    sweep = collect(read_runs(tmp_path))
+    assert [each.run.name for each in sweep.cells["block_picking", LABEL]] == ["b"]
+    path = folder / "metrics.csv"
+    assert sweep.remarks == [f"{path} cannot be read: Is a directory: the run is left out"]
+
+
+def test_a_damaged_table_of_test_scenes_leaves_the_curves(tmp_path):
+    folder = write_run(tmp_path / "a")
+    (folder / "test.csv").write_text("success,length\n1,what\n")
+    sweep = collect(read_runs(tmp_path))
+    assert sweep.success("block_picking", LABEL).mean.tolist() == [0, 0.5, 0.9, 1]
+    assert sweep.test("block_picking", LABEL) == []
+    damaged, unfinished = sweep.remarks
+    assert damaged.startswith(f"{folder / 'test.csv'}, line 2: expected numbers")
+    assert damaged.endswith("the run counts as unfinished")
+    assert unfinished == "a: unfinished, at step 400 of 400"
+
+
+def test_of_a_validation_that_stands_twice_the_later_one_counts(tmp_path):
+    write_run(tmp_path / "a")
+    with open(write_run(tmp_path / "b", seed=1) / "validation.csv", "a") as file:
+        file.write("200,0.7,0,1\n")
+    curve = collect(read_runs(tmp_path)).success("block_picking", LABEL)
+    assert curve.steps.tolist() == [100, 200, 300, 400]
+    np.testing.assert_allclose(curve.mean, [0, 0.6, 0.9, 1])
+
+
+def test_ceilings_are_those_of_the_papers_tasks():
+    assert {task for task, _ in CEILINGS} == set(TASKS)
 
 
 def test_ceilings_hold_for_what_was_measured_only():
@@ -210,5 +282,6 @@ def test_planned_runs(tmp_path, params, given, expected):
 def test_numbers_in_names_are_sorted_by_value(tmp_path):
     for name in ("copies-16", "copies-2", "copies-4", "10", "a"):
         write_run(tmp_path / name)
+    write_run(tmp_path / ".hydra")
     names = [run.name for run in read_runs(tmp_path)]
     assert names == ["10", "a", "copies-2", "copies-4", "copies-16"]

@@ -2,7 +2,7 @@
 
 import pytest
 
-from equirl.analysis.tables import markdown_table, read_table, write_table
+from equirl.analysis.tables import TableError, markdown_row, markdown_table, read_table, write_table
 
 
 def test_what_is_written_is_read(tmp_path):
@@ -29,3 +29,15 @@ def test_a_line_cut_short_is_left_out(tmp_path):
 def test_a_markdown_table_has_a_line_a_row():
     lines = markdown_table(["run", "steps"], [("a", 1), ("b", 2)]).splitlines()
     assert lines == ["| run | steps |", "| --- | --- |", "| a | 1 |", "| b | 2 |"]
+
+
+def test_a_bar_in_a_cell_ends_no_cell():
+    assert markdown_row(["a|b", 1]) == r"| a\|b | 1 |"
+
+
+def test_what_cannot_be_read_is_named(tmp_path):
+    (tmp_path / "a.csv").mkdir()
+    with pytest.raises(TableError, match="a.csv cannot be read: Is a directory"):
+        read_table(tmp_path / "a.csv")
+    (tmp_path / "b.csv").write_text("step\n")
+    assert read_table(tmp_path / "b.csv" / "metrics.csv") == {}

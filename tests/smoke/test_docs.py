@@ -26,6 +26,9 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from tests.commands import ROOT
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+#: Whose public names are the reference.
+PACKAGES = ("symmetry", "modules", "objectives", "data", "envs", "collectors", "training")
+PACKAGES += ("analysis", "config")
 REFUSED = re.compile(r"^(\$ python .*)\nerror: ", re.MULTILINE)  # shown for its complaint
 SCRIPT = re.compile(r"python experiments/(\w+)\.py([^|;&>]*)")
 
@@ -212,7 +215,7 @@ def test_the_site_has_all_public_names(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=300)
     assert done.returncode == 0 and "arning" not in done.stderr, done.stderr
     ids = check_links(tmp_path)
-    for package in ("symmetry", "modules", "objectives", "data", "envs", "collectors", "training"):
+    for package in PACKAGES:
         names = importlib.import_module(f"equirl.{package}").__all__
         reference = ids[tmp_path / "reference" / "equirl" / f"{package}.html"]
         assert set(names) <= reference, set(names) - reference

@@ -91,6 +91,19 @@ def test_a_sweep_without_anything_to_draw(here, tmp_path):
     write_run(tmp_path / "a", returns=[], success=[], test=None)
     code, _, err = here("figures.py", f"sweep={tmp_path}")
     assert code == 1 and "nothing to draw yet; a: no episode has ended, left out" in err
+    for name in "bcdefg":
+        write_run(tmp_path / name, returns=[], success=[], test=None)
+    code, _, err = here("figures.py", f"sweep={tmp_path}")
+    assert code == 1 and err.strip().endswith("; c: no episode has ended, left out; and 4 more")
+
+
+def test_dollar_signs_in_folders_titles_and_values(here, tmp_path):
+    for seed in (0, 1):
+        write_run(tmp_path / "a$b_{$c" / f"{seed}", seed=seed, demos_file=f"$HOME/{seed}$x^")
+    code, out, err = here("figures.py", f"sweep='{tmp_path / 'a$b_{$c'}'")
+    assert code == 0 and "demos.file=$HOME/0$x^" in out, err
+    code, out, err = here("runs.py", str(tmp_path / "a$b_{$c"), "--html", str(tmp_path / "a.html"))
+    assert code == 0, err
 
 
 def test_the_commands_of_the_page(here, sweep, tmp_path, monkeypatch):

@@ -1,5 +1,6 @@
 """Runs and sweeps listed, and the page about a sweep, as a user calls them."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -38,8 +39,29 @@ def test_the_list(here, sweep):
     assert "Block Picking, Equivariant SAC, D4, seed 1  running" in rows["b"]
     assert "failed: MemoryError: 9 GB" in rows["c"]
     assert f"{sweep}: 3 runs" in out
+    # 200 steps of b and 400 of the one to come, 50 a minute; none of c, which has failed.
+    assert "1 running, 1 finished, 1 failed; 1 of 4 to come; 600 of 1,200 steps made; 12 min" in out
+    assert out.strip().endswith("12 min left, 1 run at a time")
+
+
+def test_the_training_that_is_left_when_nothing_runs(here, sweep):
+    code, out, err = here("runs.py", str(sweep))
+    assert code == 0, err
     # 200 steps of b, 400 of c and 400 of the one to come, 50 a minute.
-    assert "1 running, 1 finished, 1 failed; 1 of 4 to come; 600 of 1,200 steps made; 20 min" in out
+    assert out.strip().endswith("steps made; 20 min of training left, nothing runs")
+
+
+def test_a_reader_that_has_seen_enough_ends_it(sweep):
+    ours, theirs = os.pipe()
+    os.close(ours)  # as of head, once it has its lines
+    command = [sys.executable, str(ROOT / "experiments" / "runs.py"), str(sweep)]
+    held = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    for arguments in ([], ["--html", str(sweep / "a.html")]):
+        done = subprocess.run(
+            [*command, *arguments], stdout=theirs, stderr=subprocess.PIPE, env=held
+        )
+        assert (done.returncode, done.stderr) == (141, b"")
+    os.close(theirs)
 
 
 def test_all_folders_of_outputs_are_listed_by_default(here, sweep, tmp_path, monkeypatch):
@@ -69,6 +91,14 @@ def test_no_runs_are_told_in_a_sentence(here, tmp_path):
     assert code == 1 and f"error: no runs below {tmp_path}" in err
 
 
+def test_a_page_is_about_a_sweep_and_others_are_named(here, sweep):
+    write_run(sweep.parent / "other" / "a")
+    code, _, err = here("runs.py", str(sweep.parent), "--html", str(sweep / "a.html"))
+    others = f"{sweep.parent / 'other'}, {sweep}"
+    assert code == 1
+    assert err.strip() == f"error: {sweep.parent} is no sweep; --html takes one of {others}"
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
@@ -91,12 +121,13 @@ def test_the_page(here, sweep, tmp_path):
     assert page.startswith("<!doctype html>") and "Figure 13: demonstrations" in page
     assert '<a href="../outputs/sweep/a/report.md">a</a>' in page
     assert "failed: MemoryError: 9 GB" in page and "1 of 4 to come" in page
+    assert "Block Picking, 20 demonstrations, seed 0" in page  # as in the figure
 
 
 def test_the_list_loads_no_torch(sweep):
     code = (
         "import sys, runs; runs.main(sys.argv[1:]);"
-        "sys.exit(str(sorted({'torch', 'hydra', 'matplotlib'} & set(sys.modules))))"
+        "sys.exit(str(sorted({'torch', 'hydra', 'matplotlib', 'scipy'} & set(sys.modules))))"
     )
     command = [sys.executable, "-c", code, str(sweep)]
     done = subprocess.run(command, cwd=ROOT / "experiments", capture_output=True, text=True)
