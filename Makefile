@@ -24,8 +24,13 @@ demo: setup
 test: setup
 	$(BIN)/python -m pytest -n 2 -m "not slow"
 
-test-all: setup
+test-all: setup $(VENV)/.ray
 	$(BIN)/python -m pytest -n 2
+
+# Ray is large, and only one test asks for the real one.
+$(VENV)/.ray: $(READY)
+	$(BIN)/uv pip install --quiet --compile-bytecode --python $(BIN)/python -c constraints.txt -e '.[ray]'
+	touch $@
 
 lint: setup
 	$(BIN)/ruff check .

@@ -53,9 +53,14 @@ def print_plan(runs: Sequence[Run], *, parallel: int = 1, threads: int = 0) -> N
             left = remaining_seconds(config, costs, run.step, begun=run.step > 0) / 3600
             source = "measured" if costs.measured else "like runs"
         hours.append(left)
-        print(markdown_row([str(run), run.describe(), f"{left:.2g}", source]), flush=True)
+        print(markdown_row([str(run), run.describe(), _hours(left), source]), flush=True)
     total, last = sum(hours), makespan(hours, parallel)
     print(
         f"\n{count_states(runs)}\n"
-        f"left: {total:.2g} hours of runs, {last:.2g} with {parallel} at a time"
+        f"left: {_hours(total)} hours of runs, {_hours(last)} with {parallel} at a time"
     )
+
+
+def _hours(hours: float) -> str:
+    """Two digits of a few hours; of many all, with no power of ten."""
+    return f"{hours:.0f}" if hours >= 10 else f"{hours:.2g}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib import import_module
+from traceback import extract_tb
 from typing import NamedTuple
 
 from tensordict.nn import TensorDictSequential
@@ -48,17 +49,19 @@ class _Methods(dict[str, Method]):
         """Imports a method.
 
         Raises:
-            ValueError: There is none of that name; `dict.get` does not import and gives None.
+            ValueError: There is none of that name, or its module ends in an error, which the
+                message places; `dict.get` does not import and gives None.
         """
         module, colon, attribute = name.partition(":")
-        if not colon:
+        if not colon or name.startswith("."):  # relative to nothing
             raise ValueError(
                 f"expected one of {', '.join(self)} or 'package.module:NAME', got {name!r}"
             )
         try:
             method = getattr(import_module(module), attribute)
-        except (ImportError, AttributeError, ValueError) as error:
-            raise ValueError(f"method {name!r} cannot be imported: {error}") from None
+        except Exception as error:  # whatever the user's code raises
+            told = f"{type(error).__name__}: {error}{_place(error)}"
+            raise ValueError(f"method {name!r} cannot be imported: {told}") from error
         if not isinstance(method, Method):
             raise ValueError(f"a method must be an {__name__}.Method, got {method!r}")
         return method
@@ -71,3 +74,9 @@ METHODS = _Methods(
     rad=Method(make_rad_actor, make_rad_critic, equivariant=False, crops=True),
     ferm=Method(make_ferm_actor, make_ferm_critic, equivariant=False, crops=True, contrastive=True),
 )
+
+
+def _place(error: Exception) -> str:
+    """Where the module that was being imported had come to; nothing where none had begun."""
+    frames = [each for each in extract_tb(error.__traceback__) if each.name == "<module>"]
+    return f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""

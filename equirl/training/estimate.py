@@ -50,8 +50,10 @@ class Costs:
     Attributes:
         demonstration: An episode of the expert, with its reset.
         pretraining: A step of a contrastive encoder's, before training.
-        step: A step of training, with its updates and its share of checkpoints.
-        evaluation: An episode of the greedy policy.
+        step: A step of training, with its updates; read from a run, with its share of checkpoints
+            too, which are not measured.
+        evaluation: An episode of the greedy policy; read from a run that measured its symmetry,
+            with its share of that too.
         measured: Whether any was measured for the purpose, instead of read from a run.
     """
 
@@ -98,7 +100,7 @@ class Estimator:
             parts = _recorded_parts(config, folder)
         except (ConfigError, TableError):
             return
-        self._recorded.setdefault(_like(config, _LEARNING + _PLAYING), {}).update(parts)
+        self._recorded.setdefault(_like(config, _ALL), {}).update(parts)
 
     def costs(self, config: Config) -> Costs:
         """The parts of a run; what has not been read or measured yet is measured.
@@ -108,7 +110,7 @@ class Estimator:
         Raises:
             ConfigError: A device or a backend that this machine does not have.
         """
-        recorded = self._recorded.get(_like(config, _LEARNING + _PLAYING), {})
+        recorded = self._recorded.get(_like(config, _ALL), {})
         if _needed(config) <= recorded.keys():
             unneeded = {"demonstration": 0.0, "pretraining": 0.0}
             return Costs(**(unneeded | recorded), measured=False)
@@ -137,6 +139,9 @@ _LEARNING = (
     *("device", "threads", "backend"),
 )
 _PLAYING = ("env.", "demos.options", "mode", "method.name")
+
+#: And of what is read of a run, whose evaluations may measure the symmetry, too.
+_ALL = (*_LEARNING, *_PLAYING, "evaluation.equivariance")
 
 #: Of these, what changes numbers but no time.
 _TIMELESS = (

@@ -21,6 +21,7 @@ from equirl.analysis import read_table
 from equirl.analysis.tables import read_rows
 from equirl.config import Config, ConfigError, flatten, write_atomically
 from equirl.training.folder import TENSORBOARD, WANDB
+from equirl.training.privacy import private_value
 
 __all__ = ["Averages", "MetricsLog", "Tracker"]
 
@@ -203,7 +204,7 @@ class _TensorBoard:
 
         self._earlier = list((folder / TENSORBOARD).glob("events.out.tfevents.*"))
         self._logger = TensorboardLogger(TENSORBOARD, log_dir=str(folder))
-        self._config = flatten(config)
+        self._config = _shown(config)
 
     def begin(self, tables: Mapping[str, Sequence[Row]]) -> None:
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
@@ -276,7 +277,7 @@ class _Wandb:
                 mode=config.logging.wandb_mode,
                 save_dir=str(folder),
                 project=config.logging.wandb_project,
-                config=flatten(config),
+                config=_shown(config),
                 log_env_packages=not config.logging.private,
                 # Offline there is nothing to resume, and wandb would warn that it does not.
                 resume=None if self._offline else "allow",
@@ -299,8 +300,8 @@ class _Wandb:
                     shutil.rmtree(earlier, ignore_errors=True)
 
     def write(self, table: str, row: Row) -> None:
-        # A resumed run writes what it has written before: the same numbers.
-        if row["step"] > self._sent.get(table, -1):
+        # A resumed run writes what it has written before, the same numbers; a test is another.
+        if table == "test" or row["step"] > self._sent.get(table, -1):
             values = {f"{table}/{name}": value for name, value in row.items() if name != "step"}
             self._logger.log_metrics(values, step=int(row["step"]))
 
@@ -313,6 +314,12 @@ class _Wandb:
 
     def close(self) -> None:
         self._logger.experiment.finish()
+
+
+def _shown(config: Config) -> dict[str, Any]:
+    """The configuration as trackers show it, which others than its user may see."""
+    flat = flatten(config)
+    return private_value(flat) if config.logging.private else flat
 
 
 def _kept_id(path: Path) -> str:

@@ -29,6 +29,7 @@ from equirl.config import Config, ConfigError, write_atomically
 from equirl.modules import METHODS, resolve_backend
 from equirl.symmetry import SymmetryGroup
 from equirl.training.folder import CHECKPOINT, METRICS, RECORD
+from equirl.training.privacy import private_word, without_paths
 from equirl.training.repository import describe_repository
 from equirl.training.seeding import Purpose, scene_seed
 
@@ -38,6 +39,18 @@ _log = logging.getLogger("equirl")
 
 #: What results may depend on.
 _PACKAGES = ("torch", "torchrl", "tensordict", "escnn", "pybullet", "numpy", "scipy", "numba")
+
+#: Of the record; whoever changes what stands in it counts on.
+_FORMAT = 1
+
+#: What is read of the sessions before, and what it is.
+_READ: dict[str, type | tuple[type, ...]] = {
+    "outcome": (str, type(None)),
+    "first_step": int,
+    "minutes": (int, float),
+    "versions": dict,
+    "code": (dict, type(None)),
+}
 
 
 class Session:
@@ -107,10 +120,23 @@ def read_record(folder: Path) -> dict[str, Any] | None:
     """The record of a run's folder; None when it has none that can be read."""
     try:
         record = json.loads((folder / RECORD).read_text())
-        summarize_record(record)  # what has not all of this is no record
+        _check(record)
     except (OSError, ValueError, TypeError, KeyError, IndexError, AttributeError):
         return None
     return record
+
+
+def _check(record: Any) -> None:
+    """Looks at all that is read of a record later; what lacks any of it is refused, anyhow."""
+    if record["format"] != _FORMAT:
+        raise ValueError(f"expected format {_FORMAT}, got {record['format']!r}")
+    for session in record["sessions"]:
+        datetime.fromisoformat(session["started"])
+        if not all(isinstance(session[key], kinds) for key, kinds in _READ.items()):
+            raise TypeError(f"expected {_READ}, got {session}")
+        if code := session["code"]:
+            _ = code["commit"], hash(code["digest"]), code["changes"]
+    summarize_record(record)
 
 
 def summarize_record(record: Mapping[str, Any]) -> list[str]:
@@ -143,7 +169,7 @@ def _earlier_record(folder: Path) -> dict[str, Any]:
     if record is None:
         if (folder / RECORD).exists():
             _log.warning("%s cannot be read; the record of this run begins anew", RECORD)
-        record = {"format": 1, "minutes": 0.0, "sessions": []}
+        record = {"format": _FORMAT, "minutes": 0.0, "sessions": []}
     return record
 
 
@@ -169,7 +195,7 @@ def _describe_session(
         "first_step": step,
         "last_step": step,
         "minutes": 0.0,
-        "command": [_without_path(word) for word in command] if private else command,
+        "command": [private_word(word) for word in command] if private else command,
         "versions": _versions(),
         "code": describe_repository(folder, earlier),
         "machine": _describe_machine(),
@@ -245,30 +271,6 @@ def _backend(config: Config) -> str:
         return resolve_backend(config.backend, group, config.torch_device)
     except (ValueError, RuntimeError, ConfigError):  # told by what builds the networks
         return config.backend
-
-
-def without_paths(text: str) -> str:
-    """A text whose absolute paths are relative to the working folder or the user's.
-
-    Of others the last part is left.
-    """
-    # A slash in the middle of a word is a relative path's, or belongs to a date or a link.
-    return re.sub(r"(?<![\w./~-])(?:/[^/\s'\",;=\[\]()]+)+/?", lambda it: _shorten(it[0]), text)
-
-
-def _without_path(word: str) -> str:
-    """A word of a command line, ``key=/a path`` for one, likewise."""
-    key, sign, value = word.rpartition("=")
-    bare = value.strip("'\"")
-    return f"{key}{sign}{_shorten(bare) if bare.startswith('/') else without_paths(value)}"
-
-
-def _shorten(text: str) -> str:
-    path = Path(text)
-    for place, name in ((Path.cwd(), ""), (Path.home(), "~/")):
-        if path.is_relative_to(place):
-            return f"{name}{path.relative_to(place)}"
-    return f".../{path.name}"
 
 
 def _warn_of_changes(before: dict[str, Any], now: dict[str, Any]) -> None:

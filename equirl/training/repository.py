@@ -12,7 +12,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import equirl
-from equirl.config import write_atomically
 from equirl.training.folder import CHANGES
 
 __all__ = ["describe_repository"]
@@ -44,14 +43,14 @@ def describe_repository(folder: Path, earlier: list[dict[str, Any]]) -> dict[str
     commit = _git(place, "rev-parse", "HEAD")
     if top is None or commit is None:
         return None
-    root = Path(top.strip())
+    root = Path(_text(top))
     changes = _uncommitted(root)
-    others = _git(root, "ls-files", "--others", "--exclude-standard", "-z", "--", "*.py") or ""
-    new = [name for name in others.split("\0") if name]
+    others = _git(root, "ls-files", "--others", "--exclude-standard", "-z", "--", "*.py") or b""
+    new = [name for name in os.fsdecode(others).split("\0") if name]
     more = [f"and {len(new) - _MOST_NEW} more"] if len(new) > _MOST_NEW else []
     code: dict[str, Any] = {
         "of": of,
-        "commit": commit.strip(),
+        "commit": _text(commit),
         "dirty": bool(changes or new),
         "untracked": new[:_MOST_NEW] + more,  # beside it: a patch does not hold them
         "changes": None,
@@ -62,38 +61,45 @@ def describe_repository(folder: Path, earlier: list[dict[str, Any]]) -> dict[str
     return code
 
 
-def _digest(changes: str, root: Path, new: list[str]) -> str:
+def _digest(changes: bytes, root: Path, new: list[str]) -> str:
     """The same for the same code: of the difference to the commit and of the new files."""
-    digest = hashlib.blake2b(changes.encode(), digest_size=8)
+    digest = hashlib.blake2b(changes, digest_size=8)
     for name in new:
-        digest.update(f"\0{name}\0".encode())
+        digest.update(os.fsencode(f"\0{name}\0"))
         with suppress(OSError):  # gone since it was listed, or not ours to read
             digest.update(hashlib.blake2b((root / name).read_bytes()).digest())
     return digest.hexdigest()
 
 
-def _uncommitted(root: Path) -> str:
+#: What makes a difference one that `git apply` takes, whatever the user has configured.
+_APPLICABLE = (
+    *("--no-ext-diff", "--no-textconv", "--no-color", "--binary", "--unified=3"),
+    *("--src-prefix=a/", "--dst-prefix=b/", "--submodule=short"),
+)
+
+
+def _uncommitted(root: Path) -> bytes:
     """The difference of a repository's files to its commit; empty when it cannot be told.
 
     Through a copy of the index, which `git diff` would refresh: another program may be using it.
     """
-    index = _git(root, "rev-parse", "--git-path", "index")
-    with TemporaryDirectory() as temporary:
-        copy = Path(temporary, "index")
-        try:
+    index = _git(root, "rev-parse", "--git-path", "index") or b""
+    try:
+        with TemporaryDirectory() as temporary:
+            copy = Path(temporary, "index")
             # With its time, by which git knows what may have changed since.
-            shutil.copy2(root / (index or "").strip(), copy)
-        except OSError:
-            return ""
-        command = ("diff", "--no-ext-diff", "--no-color", "HEAD")
-        return _git(root, *command, GIT_INDEX_FILE=str(copy)) or ""
+            shutil.copy2(root / _text(index), copy)
+            command = ("diff", *_APPLICABLE, "HEAD")
+            return _git(root, *command, GIT_INDEX_FILE=str(copy)) or b""
+    except OSError:  # no index, or no room for a copy
+        return b""
 
 
 def _keep_changes(
-    changes: str, digest: str, folder: Path, earlier: list[dict[str, Any]]
+    changes: bytes, digest: str, folder: Path, earlier: list[dict[str, Any]]
 ) -> str | None:
     """Writes a difference beside the record and returns its file; None of one too large."""
-    if len(changes.encode()) > _LARGEST_CHANGES:
+    if len(changes) > _LARGEST_CHANGES:
         return None
     kept = {
         session["code"]["digest"]: session["code"]["changes"]
@@ -105,11 +111,13 @@ def _keep_changes(
     name = CHANGES
     if kept:  # each session's code can be had again
         name = f"{Path(CHANGES).stem}_{len(earlier) + 1}{Path(CHANGES).suffix}"
-    write_atomically(folder / name, changes)
+    partial = folder / f"{name}.partial"
+    partial.write_bytes(changes)  # as they are: sources may be of any encoding
+    os.replace(partial, folder / name)
     return name
 
 
-def _git(place: Path, *arguments: str, **variables: str) -> str | None:
+def _git(place: Path, *arguments: str, **variables: str) -> bytes | None:
     """What git answers; None where it is missing, has no repository or refuses."""
     elsewhere = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE")  # set within hooks of another
     environment = {key: value for key, value in os.environ.items() if key not in elsewhere}
@@ -125,4 +133,9 @@ def _git(place: Path, *arguments: str, **variables: str) -> str | None:
         )
     except (OSError, subprocess.SubprocessError):
         return None
-    return done.stdout.decode(errors="replace")
+    return done.stdout
+
+
+def _text(answer: bytes) -> str:
+    """An answer of one line: a commit, or a path of whatever encoding."""
+    return os.fsdecode(answer).strip()

@@ -28,15 +28,19 @@ class RayLauncher(Launcher):
     """
 
     def __init__(self, address: str = "local", cpus_per_run: int = 1, gpus_per_run: float = 0):
-        import ray  # noqa: F401  where it is missing, the sweep ends before it begins
-
         self.address = address
         self.resources = {"num_cpus": cpus_per_run, "num_gpus": gpus_per_run}
 
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
     ) -> None:
-        """Takes what Hydra hands over."""
+        """Takes what Hydra hands over.
+
+        Raises:
+            ImportError: Ray is missing: the sweep ends before it begins.
+        """
+        import ray  # noqa: F401  not in the constructor, whose errors Hydra replaces
+
         self.hydra_context, self.task_function, self.config = hydra_context, task_function, config
 
     def launch(

@@ -60,6 +60,25 @@ def test_a_file_with_two_tasks_is_refused(monkeypatch):
         tasks._task_of("two")
 
 
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("broken_task:Sorting", "'broken_task:Sorting' cannot be imported: ZeroDivisionError"),
+        ("mistyped_task:Sorting", r"cannot be imported: SyntaxError: .*mistyped_task\.py, line 1"),
+        ("no_such_package.tasks:Sorting", "cannot be imported: ModuleNotFoundError"),
+        ("math:Sorting", "cannot be imported: AttributeError"),
+        (".tasks:Sorting", "unknown task '.tasks:Sorting'"),
+        ("math:pi", "must be a subclass of equirl.envs.tasks.base.Task, got 3.14"),
+    ],
+)
+def test_tasks_that_cannot_be_imported_are_named(name, message, tmp_path, monkeypatch):
+    (tmp_path / "broken_task.py").write_text("1 / 0\n")
+    (tmp_path / "mistyped_task.py").write_text("class Sorting(\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ValueError, match=message):
+        make_task(name)
+
+
 @pytest.mark.parametrize("task", TASKS)
 def test_every_task_is_a_torchrl_environment(make, task):
     env = make(task, image_size=16, robot="hand")

@@ -1,6 +1,7 @@
 """Entry points in this process, which is quicker, and in processes that end with their test."""
 
 import importlib
+import logging
 import sys
 
 import pytest
@@ -13,6 +14,17 @@ def processes():
     """No process outlives the test that started it."""
     yield
     end_all()
+
+
+@pytest.fixture(autouse=True)
+def loggers():
+    """Hydra sets up all loggers for good, where no run in this process does so again."""
+    root, own = logging.getLogger(), logging.getLogger("equirl")
+    levels = root.level, own.level
+    yield
+    root.setLevel(levels[0])
+    own.setLevel(levels[1])
+    own.disabled = False
 
 
 @pytest.fixture

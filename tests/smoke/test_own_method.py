@@ -11,6 +11,11 @@ from tests.commands import ROOT, SMOKE
 
 PAGE = (ROOT / "docs" / "adding_a_method.md").read_text()
 CODE = re.search(r"```python\n(.*?)```", PAGE, re.DOTALL)[1]
+FAULTY = {
+    "unclosed": "one = 1\ntwo = (",
+    "divided": "import math\n\ndef half(of): return of / 0\n\nKEYPOINTS = half(1)",
+    "halves": "import math\n\nimport other_half",
+}
 METHOD = "method.name=my_methods:KEYPOINTS"
 
 
@@ -55,9 +60,22 @@ def test_its_features_are_where_things_are():
         ("method.name=keypoints", "expected one of equivariant, cnn, drq, rad, ferm or"),
         ("method.name=my_methods:POINTS", "cannot be imported"),
         ("method.name=no_module:KEYPOINTS", "no_module"),
+        ("method.name=.my_methods:KEYPOINTS", "'package.module:NAME', got '.my_methods:KEYPOINTS'"),
+        (
+            "method.name=unclosed:KEYPOINTS",
+            "SyntaxError: '(' was never closed (unclosed.py, line 2)",
+        ),
+        (
+            "method.name=divided:KEYPOINTS",
+            "ZeroDivisionError: division by zero ({here}/divided.py, l",
+        ),
+        ("method.name=halves:KEYPOINTS", "No module named 'other_half' ({here}/halves.py, line 3)"),
         ("method.name=my_methods:KeypointEncoder", "must be an equirl.modules.methods.Method"),
     ],
 )
-def test_its_faults_are_told_in_a_sentence(here, name, complaint):
+def test_its_faults_are_told_in_a_sentence(here, tmp_path, name, complaint):
+    for module, code in FAULTY.items():
+        (tmp_path / f"{module}.py").write_text(code)
     code, _, err = here("train.py", *SMOKE, name)
+    complaint = complaint.replace("{here}", str(tmp_path))
     assert code == 1 and "Traceback" not in err and complaint in err

@@ -170,6 +170,18 @@ def test_parts_are_read_from_the_runs_that_have_them(small_config, folder_of):
         assert estimator.costs(small_config(**changes)).measured
 
 
+def test_evaluations_that_measure_the_symmetry_take_times_of_their_own(small_config, folder_of):
+    """What their runs tell is nothing of the others, nor the other way round."""
+    plain = small_config(demos={"episodes": 0})
+    thorough = replace(plain, evaluation=replace(plain.evaluation, equivariance=True))
+    estimator = Estimator()
+    estimator.read(folder_of(thorough, evaluation_ms=9000, demonstrations_ms=0))
+    assert estimator.costs(plain).measured
+    estimator.read(folder_of(plain, evaluation_ms=6000, demonstrations_ms=0))
+    assert estimator.costs(plain).evaluation == 6.0
+    assert estimator.costs(thorough).evaluation == 9.0
+
+
 def test_a_folder_without_a_run_tells_nothing(small_config, tmp_path):
     estimator = Estimator()
     estimator.read(tmp_path / "missing")

@@ -15,6 +15,7 @@ import torch
 
 import equirl
 from equirl.training import TrainingRun, train
+from equirl.training.privacy import without_paths
 from equirl.training.provenance import read_record, record_session, summarize_record
 from tests.training.runs import assert_same_run
 
@@ -164,6 +165,44 @@ def test_changes_to_the_code_are_kept_with_the_run(tmp_path, small_config, repos
     assert code["dirty"] and code["changes"] is None and code["untracked"] == ["task.py"]
 
 
+@pytest.mark.parametrize(
+    "configured",
+    [
+        *("diff.noprefix=true", "diff.mnemonicPrefix=true", "diff.context=0"),
+        *("color.diff=always", "diff.upper.textconv=tr a-z A-Z <"),
+    ],
+)
+def test_kept_changes_apply_whatever_git_is_told(tmp_path, small_config, repository, configured):
+    """To text, to text of another encoding, and to what is no text."""
+    files = {"one.py": b"# caf\xe9\none\n", "two.bin": bytes(range(256)), "three.upper": b"three\n"}
+    same = 9 * b"same\n"
+    (repository / ".gitattributes").write_text("*.upper diff=upper\n")
+    for name, content in files.items():
+        (repository / name).write_bytes(same + content + same)
+    git(repository, "add", ".")
+    commit(repository)
+    git(repository, "config", *configured.split("=", 1))
+    for name, content in files.items():
+        (repository / name).write_bytes(same + content[::-1] + same)
+    assert record(small_config(), tmp_path / "run")["sessions"][0]["code"]["changes"]
+    git(repository, "checkout", "-q", ".")
+    git(repository, "apply", str(tmp_path / "run/changes.patch"))
+    for name, content in files.items():
+        assert (repository / name).read_bytes() == same + content[::-1] + same, name
+
+
+def test_no_room_for_a_copy_of_the_index_ends_no_run(
+    tmp_path, small_config, repository, monkeypatch
+):
+    def full():
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("equirl.training.repository.TemporaryDirectory", full)
+    (repository / "equirl/__init__.py").write_text("two\n")
+    code = record(small_config(), tmp_path / "run")["sessions"][0]["code"]
+    assert code["commit"] == git(repository, "rev-parse", "HEAD") and code["changes"] is None
+
+
 def test_new_files_are_code_too(tmp_path, small_config, repository, caplog):
     """What is in them counts, as does how many there are."""
     config, folder = small_config(), tmp_path / "run"
@@ -247,7 +286,7 @@ def test_nothing_names_a_person_a_computer_or_a_path_unless_asked(
         assert not [name for name in names if f'"{name}"' in machine]
         assert session["command"][1:] == [
             ".../train.py",
-            "output=run",
+            "output=./run",
             "demos.file=~/my data/d.hdf5",
             "demos.file=.../d.hdf5",
             "a=b/c",
@@ -256,13 +295,75 @@ def test_nothing_names_a_person_a_computer_or_a_path_unless_asked(
 
 
 @pytest.mark.parametrize(
-    "damage", ["", "{", "[]", '{"sessions": [{}]}', '{"sessions": []}', "versions"]
+    ("said", "private"),
+    [
+        # With the sign that ends a key, in a word or in place of one.
+        ("output=/home/bob/lr=0.1/c", "output=.../c"),
+        ('resume="/home/bob/a=b/c"', "resume=.../c"),
+        ("/home/bob/a=b/train.py", ".../train.py"),
+        ("--config-dir=/home/bob/a=b/c", "--config-dir=.../c"),
+        ("hydra/launcher=ray", "hydra/launcher=ray"),
+        # With blanks: of the user's own, of others.
+        ("a={file:{home}/my data/d.hdf5}", "a={file:~/my data/d.hdf5}"),
+        ("output=/mnt/jo smith/c", "output=.../c"),
+        ("seeds=[{work}/a,{home}/b,/mnt/c]", "seeds=[./a,~/b,.../c]"),
+        # In what follows a flag or stands in a link.
+        ("compiler=g++ -I/home/bob/x -L/home/bob/lib", "compiler=g++ -I.../x -L.../lib"),
+        ("-I{home}/x", "-I~/x"),
+        ("url=file:///home/bob/x", "url=file://.../x"),
+        ("url=https://host.org/a/b", "url=https://host.org/a/b"),
+    ],
+)
+def test_paths_of_the_command_line_are_shortened(
+    tmp_path, small_config, monkeypatch, said, private
+):
+    home, work = tmp_path / "jo smith", tmp_path / "jo smith/project"
+    work.mkdir(parents=True)
+    monkeypatch.chdir(work)
+    monkeypatch.setenv("HOME", str(home))
+    said = said.replace("{home}", str(home)).replace("{work}", str(work))
+    monkeypatch.setattr(sys, "argv", ["train.py", said])
+    made = record(small_config(), tmp_path / "run")
+    assert made["sessions"][0]["command"][2] == private
+
+
+def test_the_users_folder_may_be_the_working_folder_or_inside_it(tmp_path, monkeypatch):
+    home = tmp_path / "bob"
+    home.mkdir()
+    monkeypatch.setenv("HOME", str(home))
+    text = f"no space (1 / 2) for {home}/run, nor in {home}."
+    for folder in (tmp_path, Path("/"), home):
+        monkeypatch.chdir(folder)
+        assert without_paths(text) == "no space (1 / 2) for ~/run, nor in ~."
+    assert without_paths(f"{home}by/run {home}-2/run") == ".../run .../run"  # of others
+    assert without_paths("'/mnt/my disk/d.hdf5': gone") == "'.../d.hdf5': gone"
+
+
+def damaged(record: dict, damage: str) -> str:
+    """A record that was whole: with a key less, or with a value of another kind."""
+    session = record["sessions"][0]
+    if damage == "format":
+        record["format"] = 2
+    elif damage == "code":
+        session["code"] = {"commit": "0", "of": "equirl", "dirty": False, "changes": None}
+    elif damage.startswith("no "):
+        del session[damage.removeprefix("no ")]
+    else:
+        session[damage] = []
+    return json.dumps(record)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        *("", "{", "[]", '{"sessions": [{}]}', '{"sessions": []}', "format", "versions", "code"),
+        *("no outcome", "no minutes", "minutes", "no started", "started", "no first_step"),
+    ],
 )
 def test_a_damaged_record_does_not_keep_a_run_from_going_on(tmp_path, small_config, damage, caplog):
-    if damage == "versions":  # of another kind
+    if damage.removeprefix("no ").isidentifier():
         whole = record(small_config(), tmp_path)
-        whole["sessions"][0]["versions"] = []
-        damage = json.dumps(whole)
+        damage = damaged(whole, damage)
     (tmp_path / "run.json").write_text(damage)
     assert read_record(tmp_path) is None
     made = record(small_config(), tmp_path)

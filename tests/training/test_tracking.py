@@ -164,15 +164,24 @@ def test_trackers_have_configuration_result_and_film(tmp_path, tracked):
 
 
 @pytest.mark.parametrize("private", [True, False])
-def test_wandb_is_told_of_host_and_paths_on_request_only(tmp_path, tracked, private):
-    logging = {"wandb": True, "tensorboard": False, "private": private}
-    with closing(MetricsLog(tmp_path, tracked(logging=logging))) as log:
+def test_trackers_are_told_of_host_and_paths_on_request_only(tmp_path, tracked, private):
+    logging = {"tensorboard": True, "wandb": True, "private": private}
+    config = tracked(demos={"file": "/home/somebody/secret data/d.hdf5"}, logging=logging)
+    config.env.options["meshes"] = {"folder": "/mnt/shared/meshes", "others": ["/mnt/more/pans"]}
+    with closing(MetricsLog(tmp_path, config)) as log:
         log.rewind(0)
         log.write("metrics", {"step": 1, "length": 3})
     kept = str(wandb_records(tmp_path))
     kept += "".join(path.read_text() for path in tmp_path.glob("wandb/offline*/files/*"))
-    assert (str(ROOT) in kept) is not private
+    events = b"".join(path.read_bytes() for path in tmp_path.glob("tensorboard/*")).decode("latin1")
+    assert not private or str(ROOT) not in kept
+    assert (str(tmp_path) in kept) is not private
     assert (f'"{platform.node()}"' in kept) is not private
+    for shown in (kept, events):
+        for path in ("/home/somebody", "secret data", "/mnt/shared", "/mnt/more"):
+            assert (path in shown) is not private, path
+        assert all(name in shown for name in ("/d.hdf5", "/meshes", "/pans"))
+    assert config.demos.file.startswith("/home")  # which the run itself reads
 
 
 def test_points_that_an_online_run_has_are_not_sent_again(tmp_path, small_config):
@@ -186,7 +195,7 @@ def test_points_that_an_online_run_has_are_not_sent_again(tmp_path, small_config
         """What is used of TorchRL's logger, connected to a run of an earlier session."""
 
         experiment = SimpleNamespace(
-            summary={"metrics/step": 20, "metrics/length": 3, "validation/step": 10, "_step": 7}
+            summary={"metrics/step": 20, "validation/step": 10, "test/step": 20, "_step": 7}
         )
 
         @staticmethod
@@ -199,10 +208,13 @@ def test_points_that_an_online_run_has_are_not_sent_again(tmp_path, small_config
     tracker.write("metrics", {"step": 18, "length": 3})
     tracker.write("metrics", {"step": 21, "length": 4})
     tracker.write("symmetry", {"step": 10, "mean": 0.5})
+    # A finished run that is tested again, on other scenes: the step is the same, the result not.
+    tracker.write("test", {"step": 20, "success_rate": 0.75})
     assert sent == [
         (15, {"validation/low": 0.1}),
         (21, {"metrics/length": 4}),
         (10, {"symmetry/mean": 0.5}),
+        (20, {"test/success_rate": 0.75}),
     ]
 
 

@@ -59,19 +59,20 @@ def find_task(name: str | type[Task]) -> type[Task]:
             itself.
 
     Raises:
-        ValueError: If there is no such task.
+        ValueError: If there is no such task, or its module ends in an error.
     """
     task: Any = TASKS.get(name, name) if isinstance(name, str) else name
     if isinstance(task, str):
         module, colon, attribute = task.partition(":")
-        if not colon:
+        if not colon or task.startswith("."):  # relative to nothing
             raise ValueError(
                 f"unknown task {name!r}; expected {', '.join(TASKS)} or 'package.module:Class'"
             )
         try:
             task = getattr(import_module(module), attribute)
-        except (ImportError, AttributeError, ValueError) as error:
-            raise ValueError(f"task {name!r} cannot be imported: {error}") from None
+        except Exception as error:  # whatever the user's code raises
+            told = f"{type(error).__name__}: {error}"
+            raise ValueError(f"task {name!r} cannot be imported: {told}") from error
     if not (isclass(task) and issubclass(task, Task)):
         raise ValueError(f"a task must be a subclass of {Task.__module__}.Task, got {task!r}")
     return task
