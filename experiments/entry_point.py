@@ -9,6 +9,7 @@ import logging
 import os
 import signal
 import sys
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,8 +18,11 @@ from typing import NoReturn, TypeVar
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from equirl.config import ConfigError, explain, register, to_config
 
@@ -70,7 +74,7 @@ def entry_point(name: str, schema: type[Job]) -> Callable[[Callable[[Job], None]
             try:
                 hydra.main(version_base="1.3", config_path=str(conf), config_name=name)(job)()
             except Exception as error:
-                if composed:
+                if composed or not is_mistake(error):
                     raise
                 sys.exit(f"error: {explain(error, schema)}{_missing_launcher(error)}")
             finally:
@@ -135,6 +139,17 @@ def stop(message: str) -> NoReturn:
 def is_multirun() -> bool:
     """Whether the present job is one of a multirun."""
     return HydraConfig.get().mode == RunMode.MULTIRUN
+
+
+def is_mistake(error: Exception) -> bool:
+    """Whether an error tells why a configuration cannot be composed.
+
+    Any other is one of our code, or of code that the configuration names, and keeps its traceback.
+    """
+    kinds = (ConfigError, HydraException, OmegaConfBaseException, YAMLError, OSError)
+    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+    raised_in = frame.f_globals["__name__"]  # Hydra raises a ValueError now and then
+    return isinstance(error, kinds) or raised_in.startswith("hydra.")
 
 
 def mendable() -> tuple[type[Exception], ...]:

@@ -11,6 +11,7 @@ import json
 import os
 import re
 import sys
+import time
 import traceback
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -19,10 +20,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from entry_point import mendable
-from hydra.core.hydra_config import HydraConfig
+from hydra.core.utils import JobReturn
 from omegaconf import DictConfig
-from run_processes import FAILED, report_failure
+from run_processes import quoted, report_failure
 
+from equirl.analysis.runs import CONFIG, FAILED, LOCK, METRICS, REPORT, TEST
 from equirl.config import (
     Config,
     ConfigError,
@@ -36,6 +38,9 @@ from equirl.config.schema import is_execution
 
 #: Below which those of conf/experiment name their sweeps' folders themselves.
 _EXPERIMENTS = ("outputs", "experiments")
+
+#: Seconds that runs have to save themselves before a launcher is asked again.
+_PATIENCE = 60
 
 #: Longest name of a folder; file systems end at 255 bytes.
 _LONGEST = 200
@@ -75,12 +80,14 @@ class Run:
             ConfigError: The folder holds something else.
         """
         from equirl.analysis.status import is_locked
-        from equirl.training.folder import CHECKPOINT, CONFIG, LOCK, METRICS, REPORT, TEST
+        from equirl.training.folder import CHECKPOINT, find_foreign
 
         self.state, self.step, self.has_begun = "new", 0, False
         self.reason = self.remark = ""
         there = {path.name for path in self.folder.iterdir()} if self.folder.is_dir() else set()
         if CONFIG not in there:
+            if foreign := find_foreign(there):
+                raise ConfigError(f"{self.folder} is not the folder of a run: it holds {foreign}")
             return
         if is_locked(self.folder / LOCK):
             self.state = "running"
@@ -99,13 +106,15 @@ class Run:
             elif self.state != "running":
                 self.state = "begun"
         if FAILED in there and self.state not in ("finished", "running"):
-            self.state, self.reason = "failed", (self.folder / FAILED).read_text().strip()
+            self.state, self.reason = "failed", _read_reason(self.folder / FAILED)
 
     def prepare(self) -> None:
-        """Makes the folder, with the configuration in it that the run starts from."""
-        from equirl.training.folder import CONFIG
+        """Makes the folder, with the configuration in it that the run starts from.
 
+        Why it failed before is forgotten: this time it may not be reached.
+        """
         self.folder.mkdir(parents=True, exist_ok=True)
+        (self.folder / FAILED).unlink(missing_ok=True)
         if not self.has_begun:
             save_config(self.config, self.folder / CONFIG)
 
@@ -115,21 +124,31 @@ class Run:
         Args:
             threads: Of a run that does not ask for a number.
         """
-        from equirl.training.folder import CONFIG
-
         stored = flatten(load_config(self.folder / CONFIG))
         wanted = flatten(self.config)
         wanted["threads"] = wanted["threads"] or threads
         return [
-            f"{key}={json.dumps(value)}"
+            f"{key}={quoted(value) if isinstance(value, str) else json.dumps(value)}"
             for key, value in wanted.items()
             if is_free(key) and stored.get(key) != value
         ]
 
+    def keep_error(self, job: JobReturn) -> None:
+        """Keeps in the folder what a launcher's job ended of, where that was not the training."""
+        from equirl.training.privacy import without_paths
+
+        try:
+            _ = job.return_value
+        except Exception as error:  # Hydra's way to hand it on
+            text = "".join(traceback.format_exception(error))
+            report_failure(
+                self.folder, without_paths(text) if self.config.logging.private else text
+            )
+
     @property
     def last_words(self) -> str:
         """Why it failed, in one line."""
-        return self.reason.splitlines()[-1] if self.reason else ""
+        return self.reason.splitlines()[-1] if self.reason else "unknown reason"
 
     def __str__(self) -> str:
         return self.label or self.folder.name or " ".join(self.overrides)
@@ -145,13 +164,11 @@ class Run:
 
     def _stored(self, done: bool) -> dict[str, object]:
         """The configuration in its folder; of a finished run that of another version will do."""
-        from equirl.training.folder import CONFIG
-
         try:
             return flatten(load_config(self.folder / CONFIG))
         except ConfigError as error:
             if not done:
-                raise ConfigError(f"{error}; choose another hydra.sweep.dir") from None
+                raise
             self.remark = f"finished and left alone, though {error}"
             return flatten(self.config)
 
@@ -162,10 +179,7 @@ class Run:
             if not is_free(key) and stored.get(key) != value
         ]
         if different:
-            raise ConfigError(
-                f"{self.folder} is of another configuration: {'; '.join(different)}; choose "
-                "another hydra.sweep.dir"
-            )
+            raise ConfigError(f"{self.folder} is of another configuration: {'; '.join(different)}")
 
     def _changes(self, stored: dict[str, object]) -> bool:
         """Whether what a finished run leaves would be another with this configuration."""
@@ -213,15 +227,25 @@ def give_folders(
         run.folder = sweep / name
 
 
-def go_on(config: DictConfig | None = None) -> str:
+def wait_until_saved(runs: Sequence[Run]) -> None:
+    """Looks at runs until what trained them has had time to save them."""
+    for _ in range(_PATIENCE):
+        for run in runs:
+            run.look()
+        runs = [run for run in runs if run.state == "running"]
+        if not runs:
+            break
+        time.sleep(1)
+
+
+def go_on(config: DictConfig) -> str:
     """How a sweep is gone on with.
 
     Args:
-        config: The sweep's, with Hydra's own keys; that of the present job when None.
+        config: The sweep's, with Hydra's own keys.
     """
-    hydra = config.hydra if config is not None else HydraConfig.get()
-    folder = os.path.relpath(hydra.sweep.dir)
-    if "experiment" in hydra.runtime.choices or Path(folder).parts[:2] == _EXPERIMENTS:
+    folder = os.path.relpath(config.hydra.sweep.dir)
+    if "experiment" in config.hydra.runtime.choices or Path(folder).parts[:2] == _EXPERIMENTS:
         return "the same command"
     return f"the same command and 'hydra.sweep.dir=\"{folder}\"'"
 
@@ -235,7 +259,7 @@ def recorded(folder: Path, *, private: bool) -> Iterator[None]:
         private: Whether no absolute path may be kept.
     """
     from equirl.training.folder import FolderInUse
-    from equirl.training.provenance import without_paths
+    from equirl.training.privacy import without_paths
 
     try:
         yield
@@ -281,6 +305,14 @@ def _with_digest(name: str, text: str) -> str:
         return "run"
     digest = hashlib.blake2b(text.encode(), digest_size=4).hexdigest()
     return f"{name[: _LONGEST - 9]}_{digest}"
+
+
+def _read_reason(path: Path) -> str:
+    """What a failed run left, as far as it can be read."""
+    try:
+        return path.read_text(errors="replace").strip()
+    except OSError:  # it is gone since, or was never a file
+        return ""
 
 
 def _read_step(checkpoint: Path) -> int:

@@ -16,9 +16,11 @@ from pathlib import Path
 
 from entry_point import entry_point, is_multirun, stop
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
-from run_processes import IN_USE, STOP
+from run_processes import IN_USE, STOP, is_private
 
+from equirl.analysis.runs import CONFIG, REPORT
 from equirl.config import Config, ConfigError, TrainJob, is_free, load_config, to_config
 
 
@@ -26,11 +28,13 @@ from equirl.config import Config, ConfigError, TrainJob, is_free, load_config, t
 def main(job: TrainJob) -> None:
     """Runs one training job; of a sweep, one whose folder the sweep has prepared."""
     from planning import print_plan
-    from sweeping import Run, as_config, recorded
+    from sweeping import Run, as_config
 
-    from equirl.training import CONFIG
     from equirl.training.folder import FolderInUse
 
+    if is_multirun():
+        _train_for_sweep(Path(job.resume))
+        return
     if job.resume:
         folder = Path(job.resume)
         config = _changed(load_config(folder / CONFIG))
@@ -39,23 +43,31 @@ def main(job: TrainJob) -> None:
         config = as_config(job)
     if job.dry_run:
         run = Run([], config, folder)
-        run.look()
-        print_plan([run])
-    elif is_multirun():
-        with recorded(folder, private=config.logging.private):
-            _train(config, folder, Path(HydraConfig.get().sweep.dir, STOP).exists)
-    else:
         try:
-            _train(config, folder)
-        except FolderInUse as error:
-            print(f"error: {error}", file=sys.stderr, flush=True)
-            sys.exit(IN_USE)
+            run.look()
+        except ConfigError as error:
+            raise ConfigError(f"{error}; choose another output" if job.output else error) from None
+        print_plan([run])
+        return
+    try:
+        _train(config, folder)
+    except FolderInUse as error:
+        print(f"error: {error}", file=sys.stderr, flush=True)
+        sys.exit(IN_USE)
+
+
+def _train_for_sweep(folder: Path) -> None:
+    """Trains in this process what the sweep has prepared; it goes on whatever happens here."""
+    from sweeping import recorded
+
+    hydra = HydraConfig.get()
+    with recorded(folder, private=is_private(folder, hydra.overrides.task)):
+        config = _changed(load_config(folder / CONFIG))
+        _train(config, folder, Path(hydra.sweep.dir, STOP).exists)
 
 
 def _train(config: Config, folder: Path, should_stop: Callable[[], bool] = lambda: False) -> None:
-    from sweeping import go_on
-
-    from equirl.training import REPORT, train
+    from equirl.training import train
 
     if is_multirun():  # which hands on absolute paths
         folder = Path(os.path.relpath(folder))
@@ -65,8 +77,8 @@ def _train(config: Config, folder: Path, should_stop: Callable[[], bool] = lambd
     except KeyboardInterrupt:
         outcome = None
     if outcome is None:
-        again = f"python experiments/train.py 'resume=\"{folder}\"'"
-        stop(f"stopped; go on with {go_on() if is_multirun() else again}")
+        again = f"; go on with python experiments/train.py 'resume=\"{folder}\"'"
+        stop("stopped" if is_multirun() else f"stopped{again}")
     print(outcome)
     print(f"report: {folder / REPORT}")
 
@@ -91,7 +103,10 @@ def _changed(config: Config) -> Config:
             raise ConfigError(
                 f"{text}: a run is resumed with its own configuration; only {free} may change"
             )
-    return to_config(OmegaConf.merge(OmegaConf.structured(config), OmegaConf.from_dotlist(changes)))
+    values = OmegaConf.structured(config)
+    for change in OverridesParser.create().parse_overrides(changes):
+        OmegaConf.update(values, change.key_or_group, change.value(), merge=True)
+    return to_config(values)
 
 
 if __name__ == "__main__":

@@ -26,12 +26,12 @@ def start(script: str, *arguments: str, **options: Any) -> subprocess.Popen:
     environment = {key: value for key, value in os.environ.items() if key != "DISPLAY"}
     environment |= {"HOME": "/nonexistent"}  # no wandb login, no caches to rely on
     settings = {"cwd": tempfile.gettempdir(), "env": environment | options.pop("env", {})}
+    settings["preexec_fn"] = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)
     process = subprocess.Popen(
         command,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         **{**settings, **options},
     )
     _started.append(process)

@@ -7,11 +7,12 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
+from equirl.analysis.runs import CONFIG, FAILED, LOCK, LOG, METRICS, REPORT, TEST, VIDEO
 from equirl.config import Config, ConfigError, flatten, load_config
 from equirl.config.schema import is_execution
 from equirl.training.checkpoint import check_same_config, load_checkpoint
@@ -24,6 +25,7 @@ __all__ = [
     "FAILED",
     "FILES",
     "LOCK",
+    "LOG",
     "METRICS",
     "RECORD",
     "REPORT",
@@ -35,15 +37,14 @@ __all__ = [
     "FolderInUse",
     "check_folder",
     "claim_folder",
+    "find_foreign",
     "is_finished",
     "load_run_config",
     "stop_on_interrupt",
 ]
 
-CONFIG, CHECKPOINT, LOCK = "config.yaml", "checkpoint.pt", ".lock"
-METRICS, TEST = "metrics.csv", "test.csv"
-REPORT, CURVES, VIDEO = "report.md", "curves.png", "policy.mp4"
-RECORD, CHANGES, FAILED = "run.json", "changes.patch", "failed.txt"
+CHECKPOINT, CURVES = "checkpoint.pt", "curves.png"
+RECORD, CHANGES = "run.json", "changes.patch"
 TENSORBOARD, WANDB = "tensorboard", "wandb"
 
 #: What a run leaves in its folder.
@@ -61,7 +62,7 @@ FILES = {
     RECORD: "versions, code, machine, seeds, and when the run was trained",
     CHANGES: "how the code differed from its commit",
     FAILED: "why it failed when it was trained last",
-    "log.txt": "what it said, when a launcher ran it",
+    LOG: "what it said, when a launcher ran it",
     TENSORBOARD: "the tables for TensorBoard",
     WANDB: "the tables for wandb",
     REPORT: "this page",
@@ -86,16 +87,14 @@ def check_folder(folder: Path, config: Config) -> None:
         FolderError: The folder holds files of something else.
         CheckpointError: It holds the checkpoint of a run of another configuration.
     """
-    partial = {path.name for path in folder.glob("*.partial*")}  # of writings cut short
-    # Trackers begin before the configuration is written.
-    others = {path.name for path in folder.iterdir()} - {LOCK, TENSORBOARD, WANDB} - partial
-    if not others:
-        return
+    others = {path.name for path in folder.iterdir()}
     if CONFIG not in others:
-        raise FolderError(
-            f"{folder} is not empty and not the folder of a run (it holds {sorted(others)[0]}); "
-            "choose another"
-        )
+        if foreign := find_foreign(others):
+            raise FolderError(
+                f"{folder} is not empty and not the folder of a run (it holds {foreign}); "
+                "choose another"
+            )
+        return
     try:
         stored = load_run_config(folder)
     except ConfigError as error:
@@ -108,6 +107,19 @@ def check_folder(folder: Path, config: Config) -> None:
         raise FolderError(
             f"{folder} holds the results of a run whose {CHECKPOINT} is gone; choose another folder"
         )
+
+
+def find_foreign(names: Collection[str]) -> str:
+    """The first file, by name, that is none of a run that has no configuration yet.
+
+    Args:
+        names: Of what a folder holds.
+
+    Returns:
+        Its name; empty if there is none.
+    """
+    early = {LOCK, LOG, FAILED, TENSORBOARD, WANDB}  # trackers begin before it is written
+    return min((n for n in names if n not in early and ".partial" not in n), default="")
 
 
 def is_finished(folder: Path, config: Config) -> bool:

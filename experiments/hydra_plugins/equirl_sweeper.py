@@ -6,34 +6,29 @@ with the first failure. This one hands its launcher what is left to do, whicheve
 
 from __future__ import annotations
 
-import json
 import os
-import signal
+import secrets
 import sys
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-from types import FrameType
-from typing import Any
+from typing import NoReturn
 
 import planning
+from entry_point import is_mistake
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf
-from run_processes import IN_USE, STOP, RunInProcess
-from sweeping import Run, as_config, give_folders, go_on
+from run_processes import IN_USE, STOP, RunInProcess, let_workers_import, on_interrupt, quoted
+from sweeping import Run, as_config, give_folders, go_on, wait_until_saved
 
+from equirl.analysis.runs import LOCK, SWEEP
 from equirl.config import ConfigError, TrainJob, explain, to_config
 
 #: How often a launcher is asked, when it gives up without having been stopped.
 _LAUNCHES = 3
-
-#: Seconds that runs have to save themselves before it is asked again.
-_PATIENCE = 60
 
 
 class RunsSweeper(BasicSweeper):
@@ -43,6 +38,9 @@ class RunsSweeper(BasicSweeper):
         max_batch_size: Runs handed to the launcher at a time; None: all.
         params: Values of keys, ``{"seed": "0,1"}``, which the command line replaces.
     """
+
+    config: DictConfig
+    hydra_context: HydraContext
 
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
@@ -59,7 +57,6 @@ class RunsSweeper(BasicSweeper):
             SystemExit: Not all are finished; some failed, were stopped, or another process trains
                 them.
         """
-        assert self.config is not None
         self._check_numbers()
         runs = self._runs(arguments)
         self._check(runs)
@@ -72,13 +69,12 @@ class RunsSweeper(BasicSweeper):
         print(planning.count_states(runs), flush=True)
         complaint = ""
         if pending:
-            self._check_stopped(runs)
+            self._check_stopped()
             complaint = self._train(pending, self._threads(parallel))
         self._conclude(runs, pending, complaint)
 
     def _check_numbers(self) -> None:
         """Refuses numbers of runs or cores that nothing could be trained with."""
-        assert self.config is not None
         settings = self.config.hydra.launcher
         numbers = {"sweeper.max_batch_size": self.max_batch_size}
         for name in ("array_parallelism", "cpus_per_task", "cpus_per_run"):
@@ -93,11 +89,16 @@ class RunsSweeper(BasicSweeper):
 
     def _runs(self, arguments: list[str]) -> list[Run]:
         """All combinations, each with its configuration and its folder."""
-        assert self.config is not None and self.hydra_context is not None
         loader = self.hydra_context.config_loader
         given = [f"{key}={value}" for key, value in self.params.items()] + arguments
         parsed = OverridesParser.create(config_loader=loader).parse_overrides(given)
+        for each in parsed:
+            several = each.is_sweep_override() or isinstance(each.value(), list)
+            if each.key_or_group == "experiment" and several:
+                raise ConfigError(f"{each.input_line}: one experiment a command")
         (combinations,) = self.split_arguments(parsed, None)
+        if not combinations:
+            raise ConfigError(f"the sweep has no runs: {' '.join(given)}")
         common = set.intersection(*map(set, combinations))
         runs, wrong = [], []
         for overrides in combinations:
@@ -112,7 +113,9 @@ class RunsSweeper(BasicSweeper):
                         "output= and resume= name one run; a multirun makes a folder for each"
                     )
                 runs.append(Run(list(overrides), as_config(job), label=label))
-            except Exception as error:  # Hydra's and OmegaConf's have no common base
+            except Exception as error:
+                if not is_mistake(error):
+                    raise
                 wrong.append(f"{label}: {explain(error, TrainJob)}" if label else str(error))
         if wrong:
             raise _refusal(wrong)
@@ -128,9 +131,13 @@ class RunsSweeper(BasicSweeper):
         for run in runs:
             try:
                 run.look()
-                if run.remark:
-                    print(f"{run}: {run.remark}", file=sys.stderr, flush=True)
-                if not self._launcher_is("SlurmLauncher"):  # whose machines are others
+            except ConfigError as error:
+                wrong.append(f"{run}: {error}; choose another hydra.sweep.dir")
+                continue
+            if run.remark:
+                print(f"{run}: {run.remark}", file=sys.stderr, flush=True)
+            try:
+                if not self._is_elsewhere:
                     _ = run.config.torch_device
                     processors = os.cpu_count() or 1
                     if run.config.threads > processors:
@@ -143,41 +150,48 @@ class RunsSweeper(BasicSweeper):
         if wrong:
             raise _refusal(wrong)
 
-    def _check_stopped(self, runs: Sequence[Run]) -> None:
-        """Refuses to take the file away that runs of an earlier command are to find yet."""
+    def _check_stopped(self) -> None:
+        """Refuses to take the file away that runs of other commands are to find yet."""
+        from equirl.analysis.status import is_locked
+
         stop = self._folder / STOP
-        running = [run for run in runs if run.state == "running"]
+        running = [path.parent.name for path in self._folder.glob(f"*/{LOCK}") if is_locked(path)]
         if running and stop.exists():
             raise ConfigError(
-                f"an earlier command is being stopped by {stop}, and {running[0]} is still saving "
+                f"what runs here is being stopped by {stop}, and {running[0]} is still saving "
                 "itself; try again when it has ended, or remove the file"
             )
 
     def _train(self, pending: Sequence[Run], threads: int) -> str:
         """Lets the launcher train; returns what it complained of."""
-        assert self.config is not None
         stop = self._folder / STOP
         self._folder.mkdir(parents=True, exist_ok=True)
         stop.unlink(missing_ok=True)
-        OmegaConf.save(self.config, self._folder / "multirun.yaml")
+        OmegaConf.save(self.config, self._folder / SWEEP)
         for run in pending:
             run.prepare()
-        in_process = not self._launcher_is("BasicLauncher")
         arguments = {str(run.folder): run.arguments(threads) for run in pending}
-        function: Any = self.task_function
-        if in_process:
-            function = RunInProcess(self._folder, arguments, threads)
-            _let_workers_import()
+        if self._launcher_is("BasicLauncher"):
+            return self._launch(self._launcher(self.task_function), pending, arguments)
+        let_workers_import()
+        scheduled = self._launcher_is("SlurmLauncher")
+        own = self._folder / f".{STOP}-{secrets.token_hex(4)}"  # other commands' runs go on
+        function = RunInProcess([stop, own], arguments, threads)
         launcher = self._launcher(function)
         complaint = ""
-        for _ in range(_LAUNCHES):
-            with _stopping(stop, in_process, self._launcher_is("SlurmLauncher")):
+        with on_interrupt(lambda: _leave(stop) if scheduled else _ask(own)):
+            for _ in range(_LAUNCHES):
                 complaint = self._launch(launcher, pending, arguments)
-            if not complaint or stop.exists() or self._launcher_is("SlurmLauncher"):
-                break  # a scheduler still has the other jobs, and would get them twice
-            pending = [run for run in pending if _is_left(run)]
-            if not pending:
-                break
+                if not complaint:
+                    own.unlink(missing_ok=True)  # no run that is to find it is left
+                if not complaint or scheduled:
+                    break  # a scheduler still has the other jobs, and would get them twice
+                wait_until_saved(pending)
+                if function.should_stop():
+                    return ""  # of workers that were ended, too
+                pending = [run for run in pending if run.state in ("new", "begun")]
+                if not pending:
+                    break
         return complaint
 
     def _launch(
@@ -186,24 +200,31 @@ class RunsSweeper(BasicSweeper):
         """Hands the launcher its jobs; returns what it complained of."""
         size, complaint = self.max_batch_size or len(pending), ""
         for first in range(0, len(pending), size):
+            batch = pending[first : first + size]
             jobs = [
                 [
-                    f"resume={json.dumps(str(run.folder))}",
+                    f"resume={quoted(run.folder)}",
                     *arguments[str(run.folder)],
-                    f"hydra.sweep.dir={json.dumps(str(self._folder))}",
-                    f"hydra.sweep.subdir={json.dumps(run.folder.name)}",
+                    f"hydra.sweep.dir={quoted(self._folder)}",
+                    f"hydra.sweep.subdir={quoted(run.folder.name)}",
                     "hydra.mode=MULTIRUN",
                 ]
-                for run in pending[first : first + size]
+                for run in batch
             ]
             try:
-                launcher.launch(jobs, initial_job_idx=first)
+                returns = launcher.launch(jobs, initial_job_idx=first)
+            except SystemExit as stopped:  # a run in this process, which has said so
+                if stopped.code != 130:
+                    raise
+                return ""
             except Exception as error:  # a worker that was killed, a job that was cancelled
                 complaint = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
+            else:
+                for run, job in zip(batch, returns, strict=True):
+                    run.keep_error(job)
         return complaint
 
     def _launcher(self, function: TaskFunction) -> Launcher:
-        assert self.config is not None and self.hydra_context is not None
         try:
             return Plugins.instance().instantiate_launcher(
                 hydra_context=self.hydra_context, task_function=function, config=self.config
@@ -240,27 +261,29 @@ class RunsSweeper(BasicSweeper):
     @property
     def _folder(self) -> Path:
         """The sweep's, absolute: a worker may be elsewhere."""
-        assert self.config is not None
         return Path(self.config.hydra.sweep.dir).resolve()
 
     @property
     def _choice(self) -> str:
-        assert self.config is not None
         return self.config.hydra.runtime.choices["hydra/launcher"]
 
     def _launcher_is(self, name: str) -> bool:
-        assert self.config is not None
         return self.config.hydra.launcher._target_.endswith(f".{name}")
+
+    @property
+    def _is_elsewhere(self) -> bool:
+        """Whether runs are trained on other machines, of which nothing is known here."""
+        address = self.config.hydra.launcher.get("address", "local")  # of Ray's cluster
+        return self._launcher_is("SlurmLauncher") or address != "local"
 
     def _parallel(self, runs: int) -> int:
         """How many runs the launcher trains at a time."""
-        assert self.config is not None
         settings = self.config.hydra.launcher
         if self._launcher_is("BasicLauncher"):
             return 1
         cores = len(os.sched_getaffinity(0))
         asked = settings.get("n_jobs") or settings.get("array_parallelism") or runs
-        if self._launcher_is("RayLauncher") and settings.address == "local":
+        if self._launcher_is("RayLauncher") and not self._is_elsewhere:
             asked = cores // settings.cpus_per_run
         if asked < 0:  # joblib's: -1 all cores, -2 all but one
             asked = cores + 1 + asked
@@ -268,7 +291,6 @@ class RunsSweeper(BasicSweeper):
 
     def _threads(self, parallel: int) -> int:
         """Threads of each run that does not ask for a number; 0: left to the run."""
-        assert self.config is not None
         settings = self.config.hydra.launcher
         if self._launcher_is("BasicLauncher"):
             return 0
@@ -282,52 +304,17 @@ def _refusal(wrong: Sequence[str]) -> ConfigError:
     return ConfigError(f"no run was begun, since one cannot be trained: {wrong[0]}{more}")
 
 
-def _is_left(run: Run) -> bool:
-    """Whether a run is still to be trained, once what trained it has had time to save it."""
-    for _ in range(_PATIENCE):
-        run.look()
-        if run.state != "running":
-            break
-        time.sleep(1)
-    return run.state in ("new", "begun")
-
-
-def _let_workers_import() -> None:
-    """Shows other processes, on this machine or another, where this code is."""
-    experiments = Path(__file__).parents[1]
-    before = os.environ.get("PYTHONPATH", "").split(os.pathsep)
-    paths = [str(experiments), str(experiments.parent), *before]
-    os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(path for path in paths if path))
-
-
-@contextmanager
-def _stopping(stop: Path, in_process: bool, elsewhere: bool) -> Iterator[None]:
-    """Hands the first Ctrl-C, or a termination request, on to runs in processes of their own.
-
-    Args:
-        stop: The file that tells them.
-        in_process: Whether there are such; a run in this process takes the signal itself.
-        elsewhere: Whether they are a scheduler's, who goes on without us.
-    """
-    if not in_process:
-        yield
-        return
-
-    def ask(number: int, frame: FrameType | None) -> None:
-        for each in previous:
-            signal.signal(each, insist)
-        if elsewhere:
-            os.write(2, f"\nthe jobs go on; they stop when there is a file {stop}\n".encode())
-            os._exit(130)
-        stop.touch()
-        os.write(2, b"\nstopping soon, nothing is lost; once more leaves the runs to it\n")
-
-    def insist(number: int, frame: FrameType | None) -> None:
-        os._exit(130)
-
-    previous = {n: signal.signal(n, ask) for n in (signal.SIGINT, signal.SIGTERM)}
+def _ask(stop: Path) -> None:
+    """Tells the runs of this command to save themselves."""
     try:
-        yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+        stop.touch()
+        words = "stopping soon, nothing is lost; once more leaves the runs to it"
+    except OSError as error:
+        words = f"cannot stop the runs: {error}; once more leaves them to themselves"
+    os.write(2, f"\n{words}\n".encode())  # past buffers that the interrupted code may hold
+
+
+def _leave(stop: Path) -> NoReturn:
+    """Ends this command alone."""
+    os.write(2, f"\nthe jobs go on; they stop when there is a file {stop}\n".encode())
+    os._exit(130)

@@ -1,5 +1,6 @@
 """The paper's experiments and other sweeps: what they train, and that nothing ends them."""
 
+import importlib
 import os
 import re
 import shutil
@@ -11,6 +12,8 @@ from pathlib import Path
 import pytest
 import sweeping
 from hydra import compose, initialize_config_dir
+from hydra.core.plugins import Plugins
+from hydra_plugins import equirl_sweeper
 
 from equirl.config import load_config, register
 from tests.commands import ROOT
@@ -148,6 +151,9 @@ def test_no_two_runs_are_one(second, tmp_path):
         (["seed=0,1", "threads=100000"], "threads=100000: this machine has"),
         (["seed=0,1,0"], "two are the same"),
         (["seed=0,1", "output=x"], "a multirun makes a folder for each"),
+        (["seed=range(0,0)"], "the sweep has no runs: preset=smoke seed=range(0,0)"),
+        (["+experiment=fig15,fig16"], "experiment=fig15,fig16: one experiment a command"),
+        (["+experiment=[fig15,fig16]"], "experiment=[fig15,fig16]: one experiment a command"),
     ],
 )
 def test_a_bad_combination_stops_a_sweep_before_it_begins(here, sweep, named, tmp_path):
@@ -155,6 +161,29 @@ def test_a_bad_combination_stops_a_sweep_before_it_begins(here, sweep, named, tm
     code, out, err = here("train.py", "--multirun", "preset=smoke", *given)
     assert code == 1 and named in err and "Traceback" not in err
     assert "run folder" not in out and not (tmp_path / "sweep").exists()
+
+
+def test_a_mistake_of_ours_keeps_its_traceback(here, tmp_path, monkeypatch):
+    """Nobody could mend their command line by it."""
+
+    def fail(*_):
+        raise ZeroDivisionError("planted")
+
+    Plugins.instance()  # loads the sweeper once more when it is first asked
+    monkeypatch.setattr(equirl_sweeper, "to_config", fail)
+    with pytest.raises(ZeroDivisionError):
+        here("train.py", "--multirun", "preset=smoke", f"hydra.sweep.dir={tmp_path / 'sweep'}")
+
+
+def test_other_machines_are_not_measured_by_this_one(planned):
+    """Where a cluster of Ray's trains, or SLURM's."""
+    asked = ["--multirun", "preset=smoke", "threads=100000", "device=cuda:7"]
+    for cluster in (
+        ["hydra/launcher=ray", "hydra.launcher.address=auto"],
+        ["hydra/launcher=slurm"],
+    ):
+        (run,) = planned(*asked, *cluster, "seed=0")
+        assert run.config.threads == 100_000
 
 
 def test_a_typing_error_beside_an_experiment_is_the_one_told(here):
@@ -253,6 +282,15 @@ def test_a_dry_run_of_one_run(here, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+def test_a_dry_run_in_the_folder_of_another_run(here, tmp_path):
+    """The advice is that of its command line."""
+    assert here("train.py", *TINY, f"output={tmp_path}", "steps=5")[0] == 0
+    code, _, err = here(
+        "train.py", *TINY, f"output={tmp_path}", "algorithm.tau=0.5", "dry_run=true"
+    )
+    assert code == 1 and "algorithm.tau is 0.01 there and 0.5 here; choose another output" in err
+
+
 PAGE = (Path(__file__).parents[2] / "docs" / "sweeps.md").read_text()
 
 
@@ -264,3 +302,20 @@ def test_commands_of_the_page_are_such(planned, command):
         *(text for text in given if "dry_run" not in text), "seed=0", "env=block_picking"
     )
     assert runs and all(run.config.seed == 0 for run in runs)
+
+
+def test_the_script_without_submitit_asks_for_what_it_uses():
+    (script,) = re.findall(r"^```\n(#SBATCH.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
+    asked, command = script.split("\nsrun ")
+    assert "--cpus-per-task=" in asked and "--signal=TERM@" in asked
+    assert command.startswith("--cpus-per-task=$SLURM_CPUS_PER_TASK python ")
+
+
+def test_the_site_numbers_the_steps_on_a_cluster(monkeypatch):
+    for library in ("pdoc", "markdown", "pygments"):
+        pytest.importorskip(library)
+    monkeypatch.syspath_prepend(ROOT / "docs")
+    body = importlib.import_module("build_site").render(Path("docs/sweeps.md"))
+    steps = body[body.index("120 runs on a SLURM cluster") :]
+    lists = re.findall(r'<ol(?: start="(\d+)")?>\n(.*?)</ol>', steps, re.DOTALL)
+    assert [(start, text.count("<li>")) for start, text in lists] == [("", 5), ("6", 2)]

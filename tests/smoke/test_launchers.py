@@ -1,6 +1,5 @@
 """Sweeps whose runs are processes: several at a time, killed, stopped, queued again."""
 
-import importlib.util
 import os
 import signal
 import subprocess
@@ -11,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import run_processes
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from tests.commands import ROOT, SMOKE, finish, start
 
@@ -41,19 +41,24 @@ def processes_of(text: str) -> list[int]:
 
 
 def test_joblib_trains_several_and_survives_what_kills_one(tmp_path):
-    """One is killed, of which the other knows nothing; Ctrl-C then lets that save itself."""
-    sweep = ["--multirun", *TINY, "seed=0,1", "steps=100000", f"hydra.sweep.dir={tmp_path}"]
-    sweep += ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
-    process = start("train.py", *sweep)
+    """One is killed, of which the other knows nothing; Ctrl-C then lets that save itself.
+
+    It reaches an idle worker, too, as a terminal's does. And the folder has an odd name.
+    """
+    tmp_path = tmp_path / "größe, x=1"
+    sweep = ["--multirun", *TINY, "seed=0,1", "steps=100000"]
+    sweep += [f"hydra.sweep.dir={run_processes.quoted(tmp_path)}"]
+    sweep += ["hydra/launcher=joblib", "hydra.launcher.n_jobs=3"]
+    process = start("train.py", *sweep, start_new_session=True)
     wait_for(lambda: len(list(tmp_path.glob("*/checkpoint.pt"))) == 2)
     (first,) = processes_of("seed-0")
     (second,) = processes_of("seed-1")  # at the same time
     os.kill(first, signal.SIGKILL)
     wait_for(lambda: list(tmp_path.glob("*/failed.txt")))
     assert Path(f"/proc/{second}").exists()
-    process.send_signal(signal.SIGINT)
+    os.killpg(process.pid, signal.SIGINT)
     code, out, err = finish(process)
-    assert code == 1 and "2 runs: 1 begun, 1 failed" in out
+    assert code == 1 and "2 runs: 1 begun, 1 failed" in out and "ended early" not in err
     assert "1 run failed:\nseed=0: killed by SIGKILL, as when the memory is full" in err
     assert not processes_of(f"{tmp_path}/")
     (log,) = tmp_path.glob("*seed-1*/log.txt")
@@ -75,20 +80,8 @@ def test_slurms_local_double_runs_and_skips(here, tmp_path):
     assert len(list(tmp_path.glob(".submitit/*/*.out"))) == 1  # no job was made
 
 
-@pytest.mark.skipif(
-    importlib.util.find_spec("ray") is None, reason="Ray (79 MB) is not part of the test set-up"
-)
-def test_ray_on_one_machine(here, tmp_path, monkeypatch):
-    monkeypatch.setenv("HOME", str(tmp_path))  # where Ray keeps a token of its own
-    folder = tmp_path / "sweep"
-    sweep = ["--multirun", *TINY, "seed=0", "env.max_steps=15,3", f"hydra.sweep.dir={folder}"]
-    code, out, err = here("train.py", *sweep, "hydra/launcher=ray")
-    assert code == 1 and "2 runs: 1 finished, 1 failed" in out, err
-    assert "env.max_steps=3: BlockPickingExpert failed 20 episodes in a row" in err
-
-
 STUB = """
-import signal, sys, time
+import os, signal, sys, time
 from pathlib import Path
 folder = Path(sys.argv[1].removeprefix('resume=').strip('"'))
 def save(number, frame):
@@ -124,13 +117,28 @@ def stub(tmp_path, monkeypatch):
         ("raise ZeroDivisionError('planted')", "ZeroDivisionError: planted"),
         ("import os; os.kill(os.getpid(), 9)", "killed by SIGKILL, as when the memory is full"),
         ("import os; os.abort()", "killed by SIGABRT"),
+        ("import os; os.kill(os.getpid(), 35)", "killed by signal 35"),  # a real-time one
         ("sys.exit(3)", "exit code 3"),
+        ("print('error: before'); raise ZeroDivisionError('after')", "ZeroDivisionError: after"),
+        (
+            "print('error: the disk is full\\nException ignored in: x\\nTraceback (most recent')\n"
+            "sys.exit(1)",
+            "the disk is full",
+        ),
     ],
 )
 def test_what_a_process_dies_of_is_kept(stub, rest, reason):
     folder = stub(rest)
     assert run_processes.run_in_process(folder, [], threads=1) == f"failed: {reason}"
     assert (folder / "failed.txt").read_text() == f"{reason}\n"
+
+
+def test_what_keeps_a_process_from_beginning_is_kept(stub):
+    folder = stub()
+    (folder / "log.txt").mkdir()
+    outcome = run_processes.run_in_process(folder, [], threads=1)
+    assert outcome.startswith("failed: ") and "Is a directory: '.../log.txt'" in outcome
+    assert (folder / "failed.txt").read_text() == outcome.removeprefix("failed: ") + "\n"
 
 
 def test_a_run_that_trains_elsewhere_has_not_failed(stub):
@@ -164,7 +172,7 @@ def test_threads_are_set_before_libraries_are_loaded(stub):
 
 def test_a_file_stops_runs_and_lets_none_begin(stub, tmp_path):
     folder = stub()
-    watched = run_processes.RunInProcess(tmp_path, {str(folder): []})
+    watched = run_processes.RunInProcess([tmp_path / "stop"], {str(folder): []})
     threading.Thread(
         target=lambda: (wait_for((folder / "begun").exists), (tmp_path / "stop").touch())
     ).start()
@@ -194,6 +202,33 @@ def test_a_run_saves_itself_before_its_job_is_queued_again(stub, monkeypatch):
         assert seen == [True] and signal.getsignal(signal.SIGUSR2) is requeue
     finally:
         signal.signal(signal.SIGUSR2, before)
+
+
+def test_ctrl_c_counts_where_the_sweep_watches_its_runs_itself(stub, tmp_path):
+    """As joblib lets it with n_jobs=1."""
+    folder, stop, handlers = stub(), tmp_path / "asked", set()
+
+    def should_stop() -> bool:
+        handlers.add(signal.getsignal(signal.SIGINT))
+        return stop.exists()
+
+    with run_processes.on_interrupt(stop.touch):
+        threading.Thread(
+            target=lambda: (
+                wait_for((folder / "begun").exists),
+                os.kill(os.getpid(), signal.SIGINT),
+            )
+        ).start()
+        outcome = run_processes.run_in_process(folder, [], threads=1, should_stop=should_stop)
+    assert outcome == "stopped" and (folder / "saved").exists()
+    assert signal.SIG_IGN not in handlers
+
+
+def test_a_run_can_be_interrupted_though_its_watcher_cannot(stub):
+    """By its own number, from elsewhere: the watcher of a worker has the signal blocked."""
+    folder = stub("signal.signal(signal.SIGINT, save); os.kill(os.getpid(), signal.SIGINT)")
+    with run_processes.on_interrupt(lambda: None):
+        assert run_processes.run_in_process(folder, [], threads=1) == "stopped"
 
 
 def test_a_signal_may_come_while_the_process_is_asked_how_it_is(stub, monkeypatch):
@@ -238,6 +273,23 @@ def test_no_run_outlives_a_killed_worker(stub, tmp_path):
     worker.kill()
     worker.wait()
     wait_for((folder / "saved").exists, 10)
+
+
+def test_watchers_load_no_torch():
+    code = "import sys, run_processes; assert 'torch' not in sys.modules"
+    paths = os.pathsep.join([str(ROOT / "experiments"), str(ROOT)])
+    subprocess.run(
+        [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": paths}, check=True
+    )
+
+
+@pytest.mark.parametrize(
+    "text", ["größe", "a b, x=1", 'the "first"', "it's", "a\\b", "ends in \\", '\\"', "{a: [b]}"]
+)
+def test_hydra_reads_what_was_quoted(text):
+    parser = OverridesParser.create()
+    (parsed,) = parser.parse_overrides([f"logging.wandb_project={run_processes.quoted(text)}"])
+    assert parsed.value() == text and not parsed.is_sweep_override()
 
 
 def test_slurms_configuration_is_one_that_submitit_takes():

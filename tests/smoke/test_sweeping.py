@@ -7,9 +7,11 @@ import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import sweeping
+import train as train_script
 from omegaconf import OmegaConf
 
 from equirl.analysis.labels import group_variants
@@ -111,6 +113,45 @@ def test_a_look_at_a_run_does_not_keep_it_from_beginning(tmp_path, monkeypatch):
     threading.Timer(0.3, os.close, [lock]).start()
     with claim_folder(tmp_path):
         pass
+
+
+def test_what_is_not_a_runs_is_not_trained_into(tmp_path):
+    """As a single run refuses it; what one leaves before its configuration is no hindrance."""
+    run = make_run(["a=1"])
+    run.folder = tmp_path
+    for name in (".lock", "log.txt", "failed.txt", "config.yaml.partial"):
+        (tmp_path / name).touch()
+    (tmp_path / "tensorboard").mkdir()
+    run.look()
+    assert run.state == "new"
+    (tmp_path / "thesis.tex").touch()
+    with pytest.raises(ConfigError, match=r"is not the folder of a run: it holds thesis.tex$"):
+        run.look()
+
+
+@pytest.mark.parametrize(
+    ("left", "words"),
+    [(b"MemoryError: 9 G\xe2\x82", "MemoryError: 9 G\ufffd"), (b"", "unknown reason")],
+)
+def test_a_reason_that_was_cut_short(tmp_path, left, words):
+    run = make_run(["a=1"])
+    run.folder = tmp_path
+    run.prepare()
+    (tmp_path / "failed.txt").write_bytes(left)
+    run.look()
+    assert run.state == "failed" and run.last_words == words
+
+
+@pytest.mark.parametrize("project", ["größe", "a\\b", 'x, "y"'])
+def test_texts_reach_a_run_as_they_are(tmp_path, monkeypatch, project):
+    """From the sweep to the run's command line, and from there to its configuration."""
+    run = make_run(["a=1"])
+    run.folder = tmp_path
+    run.prepare()
+    run.config.logging.wandb_project = project
+    given = SimpleNamespace(overrides=SimpleNamespace(task=run.arguments()))
+    monkeypatch.setattr(train_script.HydraConfig, "get", lambda: given)
+    assert train_script._changed(make_run([]).config).logging.wandb_project == project
 
 
 def test_a_failure_of_before_is_forgotten_when_the_run_begins(tmp_path):
