@@ -118,14 +118,11 @@ def _entries(
     entries = []
     for number, (variant, style) in enumerate(styles.items(), start=1):
         label = f"{shortened(variant, longest)} ({_seeds(sweep, variant)})"
-        entries.append((_numbered(number, label, styles), Line2D([], [], lw=1.8, **style)))
+        told = f"{number}: {label}" if len(styles) > 1 else label
+        entries.append((told, Line2D([], [], lw=1.8, **style)))
     if any(_ceilings(sweep, task) for task in sweep.tasks):
         entries.append(("expert", Line2D([], [], **_CEILING)))
     return entries
-
-
-def _numbered(number: int, label: str, styles: Mapping[str, object]) -> str:
-    return f"{number} {label}" if len(styles) > 1 else label
 
 
 def _final(lines: Sequence[Summary], tasks: int) -> list[Summary]:
@@ -195,7 +192,7 @@ def _draw_intervals(
     middle = (1 - len(styles)) / 2
     axes.set(xlim=(-0.06, 1.26), ylim=(middle - rows / 2, middle + rows / 2))
     axes.set_xticks([0, 0.25, 0.5, 0.75, 1])  # right of them there is room for the numbers
-    numbers = [_numbered(number, "", styles).strip() for number in range(1, len(styles) + 1)]
+    numbers = [str(number) if len(styles) > 1 else "" for number in range(1, len(styles) + 1)]
     axes.set_yticks(list(places.values()), numbers)
     axes.tick_params(axis="y", length=0)
     axes.grid(axis="x", alpha=0.25, lw=0.5)

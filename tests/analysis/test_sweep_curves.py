@@ -99,8 +99,8 @@ def test_variants_are_told_apart_by_numbers_and_by_lines(draw, tmp_path):
         write_run(tmp_path / f"{copies}", augmentation_copies=copies, returns=[0.5, 0.5])
     figure, sweep = draw()
     labels, _ = texts_of(figure)
-    assert labels[:2] == ["1 no augmentation (1 seed)", "2 1 copy (1 seed)"]
-    assert labels[39:] == ["40 39 copies (1 seed)", "expert"]
+    assert labels[:2] == ["1: no augmentation (1 seed)", "2: 1 copy (1 seed)"]
+    assert labels[39:] == ["40: 39 copies (1 seed)", "expert"]
     final = figure.axes[-1]
     rows = dict(zip(final.get_yticks(), final.get_yticklabels(), strict=True))
     strokes = zip(final.get_lines(), figure.legends[0].get_lines(), strict=False)
