@@ -27,15 +27,15 @@ def wait_for(condition, seconds: float = 120.0) -> None:
         time.sleep(0.05)
 
 
-def processes_of(text: str) -> list[int]:
-    """Those that train, by what stands on their command line."""
+def processes_in(sweep: Path, run: str = "") -> list[int]:
+    """Those that train a run of a sweep, by what stands on their command line."""
     found = []
     for path in Path("/proc").glob("[0-9]*/cmdline"):
         try:
             words = path.read_text().split("\0")
         except OSError:  # it has ended
             continue
-        if any(word.startswith("resume=") and text in word for word in words):
+        if any(w.startswith("resume=") and f"{sweep}/" in w and run in w for w in words):
             found.append(int(path.parent.name))
     return found
 
@@ -51,8 +51,8 @@ def test_joblib_trains_several_and_survives_what_kills_one(tmp_path):
     sweep += ["hydra/launcher=joblib", "hydra.launcher.n_jobs=3"]
     process = start("train.py", *sweep, start_new_session=True)
     wait_for(lambda: len(list(tmp_path.glob("*/checkpoint.pt"))) == 2)
-    (first,) = processes_of("seed-0")
-    (second,) = processes_of("seed-1")  # at the same time
+    (first,) = processes_in(tmp_path, "seed-0")
+    (second,) = processes_in(tmp_path, "seed-1")  # at the same time
     os.kill(first, signal.SIGKILL)
     wait_for(lambda: list(tmp_path.glob("*/failed.txt")))
     assert Path(f"/proc/{second}").exists()
@@ -60,7 +60,7 @@ def test_joblib_trains_several_and_survives_what_kills_one(tmp_path):
     code, out, err = finish(process)
     assert code == 1 and "2 runs: 1 begun, 1 failed" in out and "ended early" not in err
     assert "1 run failed:\nseed=0: killed by SIGKILL, as when the memory is full" in err
-    assert not processes_of(f"{tmp_path}/")
+    assert not processes_in(tmp_path)
     (log,) = tmp_path.glob("*seed-1*/log.txt")
     assert "stopping soon, nothing is lost" in log.read_text()
     for folder in tmp_path.glob("*seed-*"):
