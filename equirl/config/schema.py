@@ -137,7 +137,7 @@ class LoggingConfig:
     wandb: bool = False
     wandb_mode: str = one_of("offline", "online")
     wandb_project: str = "equirl"
-    private: bool = True  # no name of host or user, no absolute path in run.json and at wandb
+    private: bool = True  # no name of host or user, no absolute path in run.json and trackers
 
 
 @dataclass

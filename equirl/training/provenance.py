@@ -40,7 +40,7 @@ _log = logging.getLogger("equirl")
 #: What results may depend on.
 _PACKAGES = ("torch", "torchrl", "tensordict", "escnn", "pybullet", "numpy", "scipy", "numba")
 
-#: Of the record; whoever changes what stands in it counts on.
+#: Of the record; to be raised when what stands in it changes.
 _FORMAT = 1
 
 #: What is read of the sessions before, and what it is.
