@@ -2,6 +2,7 @@
 
 python experiments/evaluate.py run=outputs/demo episodes=200
 python experiments/evaluate.py run=outputs/demo video=policy.mp4 first=100
+python experiments/evaluate.py run=policy.pt
 """
 
 from __future__ import annotations

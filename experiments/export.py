@@ -1,6 +1,9 @@
 """Exports the policy of a run to a file that needs torch alone, or an ONNX runtime alone.
 
+Or to a small one that needs equirl, which evaluates and watches it as it does a run.
+
 python experiments/export.py run=outputs/demo format=onnx output=policy.onnx
+python experiments/export.py run=outputs/demo format=policy output=policy.pt
 python experiments/export.py check=policy.onnx                   # measures its symmetry again
 python experiments/export.py check=policy.onnx run=outputs/demo  # and compares it with the run's
 """
@@ -17,6 +20,7 @@ from equirl.config import ConfigError, ExportJob
 @entry_point("export", ExportJob)
 def main(job: ExportJob) -> None:
     """Writes the file, or reads it, and prints what was measured."""
+    from equirl.training import POLICY_SUFFIX, save_policy
     from equirl.training.export import FORMATS, check_exported, export_policy, summary
 
     if job.check:
@@ -25,14 +29,18 @@ def main(job: ExportJob) -> None:
         if job.run:
             print(f"\n{_latency(job)}")
         return
-    suffix = FORMATS[job.format].suffix
+    own = job.format == "policy"
+    suffix = POLICY_SUFFIX if own else FORMATS[job.format].suffix
     path = Path(job.output or Path(job.run, f"policy{suffix}"))
     if path.suffix != suffix:
         raise ConfigError(f"output={path}: expected a name in {suffix} for format={job.format}")
     if not Path(job.run).is_dir():
         raise ConfigError(f"run={job.run}: expected the folder of a run")
-    print(summary(export_policy(job.run, path, observations=job.observations)))
-    print(f"\npolicy: {path}")
+    if own:
+        save_policy(job.run, path)
+    else:
+        print(f"{summary(export_policy(job.run, path, observations=job.observations))}\n")
+    print(f"policy: {path}")
 
 
 def _latency(job: ExportJob, repeats: int = 200) -> str:

@@ -3,6 +3,7 @@
 python experiments/watch.py env=block_pushing policy=expert
 python experiments/watch.py env=clutter_grasping policy=random env.options.object_count=10
 python experiments/watch.py policy=outputs/demo episodes=5
+python experiments/watch.py policy=policy.pt
 python experiments/watch.py policy=demos.hdf5
 """
 
@@ -28,13 +29,13 @@ if TYPE_CHECKING:
 @entry_point("watch", WatchJob)
 def main(job: WatchJob) -> None:
     """Plays episodes, or reads them, says how they ended and where the pictures are."""
-    from equirl.training import load_policy, make_run_env
+    from equirl.training import POLICY_SUFFIX, load_policy, make_run_env
 
     if job.policy in ("expert", "random"):
         config, policy = Config(env=job.env), None
     else:
         _check_path(job.policy)
-        if Path(job.policy).is_file():
+        if Path(job.policy).is_file() and Path(job.policy).suffix != POLICY_SUFFIX:
             _watch_file(job)
             return
         config, policy = load_policy(job.policy, "auto", "auto")
@@ -46,8 +47,8 @@ def _check_path(path: str) -> None:
     """Refuses what is no policy, and keys that a run or a file settles."""
     if not Path(path).exists():
         raise ConfigError(
-            f"policy={path}: expected expert, random, the folder of a run or a file of "
-            "demonstrations"
+            f"policy={path}: expected expert, random, the folder of a run, the file of a policy "
+            "or one of demonstrations"
         )
     for text in HydraConfig.get().overrides.task:
         if text.startswith("env"):

@@ -70,7 +70,7 @@ class DemonstrationsJob:
 class EvaluateJob:
     """What the command line of ``experiments/evaluate.py`` takes."""
 
-    run: str = MISSING  # the folder of a run
+    run: str = MISSING  # the folder of a run, or the file of a policy
     episodes: int = at_least(100, 1)
     first: int = at_least(0, 0)  # number of the first test scene
     device: str = "auto"
@@ -84,8 +84,8 @@ class ExportJob:
     """What the command line of ``experiments/export.py`` takes."""
 
     run: str = ""  # the folder of the run whose policy is exported
-    format: str = one_of("torch_export", "onnx")
-    output: str = ""  # a .pt2 or .onnx file; in the run's folder when empty
+    format: str = one_of("torch_export", "onnx", "policy")
+    output: str = ""  # a .pt2, .onnx or .pt file; in the run's folder when empty
     observations: int = at_least(64, 1)  # to measure on, half of them from the run's replay buffer
     check: str = ""  # an exported file to measure again, and to compare with ``run`` if given
 
@@ -138,7 +138,8 @@ class WatchJob:
     """What the command line of ``experiments/watch.py`` takes."""
 
     env: EnvConfig = keys_of(EnvConfig)
-    # Or "random"; the folder of a run, whose environment is then used; a file of demonstrations.
+    # Or "random"; the folder of a run or the file of a policy, whose environment is then used; a
+    # file of demonstrations.
     policy: str = "expert"
     episodes: int = at_least(3, 1)  # filmed; of a file, the first ones
     sheet_episodes: int = at_least(3, 1)  # the first ones, shown on the contact sheet

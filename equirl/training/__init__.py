@@ -13,9 +13,10 @@ from equirl.training.export import (
     read_certificate,
 )
 from equirl.training.folder import CHECKPOINT, CONFIG, REPORT, FolderError, load_run_config
-from equirl.training.learner import Learner, load_learner, load_policy
+from equirl.training.learner import Learner, load_learner
 from equirl.training.loop import TrainingRun
 from equirl.training.networks import make_networks
+from equirl.training.policy import POLICY_SUFFIX, load_policy, save_policy
 from equirl.training.seeding import Purpose, scene_seed
 from equirl.training.train import train
 from equirl.training.video import film_policy
@@ -23,6 +24,7 @@ from equirl.training.video import film_policy
 __all__ = [
     "CHECKPOINT",
     "CONFIG",
+    "POLICY_SUFFIX",
     "REPORT",
     "CheckpointError",
     "Evaluation",
@@ -47,6 +49,7 @@ __all__ = [
     "make_run_expert",
     "read_certificate",
     "replay_observations",
+    "save_policy",
     "scene_seed",
     "train",
 ]

@@ -21,7 +21,7 @@ from equirl.training.networks import make_networks
 from equirl.training.representation import RepresentationLearner
 from equirl.training.seeding import Purpose, torch_generator
 
-__all__ = ["Learner", "load_learner", "load_policy"]
+__all__ = ["Learner", "load_learner"]
 
 
 class Learner:
@@ -147,24 +147,6 @@ def _average(actor: ProbabilisticActor, decay: float) -> AveragedModel:
         return torch.lerp(average, current, max(1 - decay, 1 / (int(count) + 1)))
 
     return AveragedModel(actor, avg_fn=move)
-
-
-def load_policy(
-    folder: str | Path, device: str | None = None, backend: str | None = None
-) -> tuple[Config, ProbabilisticActor]:
-    """The trained policy of a run's folder, with the run's configuration.
-
-    Args:
-        folder: The run's folder.
-        device: Where to put the policy; where it was trained when None.
-        backend: What an equivariant encoder runs on; what it was trained on when None.
-
-    Raises:
-        ConfigError: The folder is not that of a run, or the device or backend is not there.
-        CheckpointError: It holds no readable checkpoint of that configuration.
-    """
-    config, _, learner = load_learner(folder, device, backend)
-    return config, learner.policy
 
 
 def load_learner(

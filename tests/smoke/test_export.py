@@ -37,6 +37,19 @@ def test_export_and_check(here, run, format, tmp_path):
     assert "one action, one thread" in out
 
 
+def test_a_policys_own_file_is_evaluated_and_watched_as_its_run(here, run, tmp_path):
+    path = tmp_path / "policy.pt"
+    code, out, err = here("export.py", f"run={run}", "format=policy", f"output={path}")
+    assert code == 0 and out.endswith(f"policy: {path}\n"), err
+    told = [here("evaluate.py", f"run={place}", "episodes=2") for place in (run, path)]
+    assert told[0][:2] == told[1][:2] and "of 2 episodes succeed" in told[1][1]
+    watched = here("watch.py", f"policy={path}", "episodes=1", f"output={tmp_path}", "size=64")
+    assert watched[0] == 0 and "episode 1: " in watched[1], watched[2]
+    assert (tmp_path / "film.mp4").is_file() and (tmp_path / "sheet.png").is_file()
+    code, _, err = here("evaluate.py", f"run={run}/checkpoint.pt")
+    assert code == 1 and "expected the run's folder" in err and "Traceback" not in err
+
+
 def test_the_example_turns_with_the_scene(here, run):
     code, _, err = here("export.py", f"run={run}", "format=onnx", "observations=4")
     assert code == 0, err
@@ -53,8 +66,9 @@ def test_the_example_turns_with_the_scene(here, run):
     [
         ([], "run= is missing"),
         (["run={run}_none"], "run_none: expected the folder of a run"),
-        (["run={run}", "format=pickle"], "expected one of torch_export, onnx"),
+        (["run={run}", "format=pickle"], "expected one of torch_export, onnx, policy"),
         (["run={run}", "format=onnx", "output=policy.pt2"], "expected a name in .onnx"),
+        (["run={run}", "format=policy", "output=policy.pt2"], "expected a name in .pt"),
         (["run={run}", "output={run}/config.yaml/policy.pt2"], "cannot write"),
         (["run={run}", "observations=0"], "observations=0: expected 1 or more"),
         (["check=policy.onnx"], "policy.onnx not found"),

@@ -1,13 +1,9 @@
 """One gradient step, and the policy that is kept."""
 
-from contextlib import closing
-
-import pytest
 import torch
 from tensordict import TensorDict
 
-from equirl.config import save_config
-from equirl.training import TrainingRun, load_policy, train
+from equirl.training import train
 from equirl.training.learner import Learner
 from tests.transitions import transitions
 
@@ -64,20 +60,6 @@ def test_average_is_a_plain_mean_at_first_and_exponential_later(small_config):
 def test_without_averaging_the_actor_itself_is_kept(small_config):
     learner = Learner(small_config())
     assert learner.policy is learner.actor
-
-
-@pytest.mark.parametrize("averaging", [0.0, 0.9])
-def test_a_loaded_policy_acts_as_the_trained_one(tmp_path, small_config, averaging):
-    config = small_config(steps=6, algorithm={"averaging": averaging})
-    save_config(config, tmp_path / "config.yaml")
-    with closing(TrainingRun(config, tmp_path)) as training:
-        training.run()
-    _, policy = load_policy(str(tmp_path))
-    data = batch()
-    with torch.no_grad():
-        expected = training.learner.policy(data.select("depth", "holding"))
-        loaded = policy(data.select("depth", "holding"))
-    assert torch.equal(loaded["action"], expected["action"])
 
 
 def test_train_returns_the_evaluation_it_reports(tmp_path, small_config):
