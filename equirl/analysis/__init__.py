@@ -2,6 +2,7 @@
 
 from equirl.analysis.runs import Run, read_runs
 from equirl.analysis.statistics import (
+    count_collapses,
     first_reaching,
     interquartile_mean,
     mean_and_error,
@@ -24,6 +25,7 @@ __all__ = [
     "Sweep",
     "TableError",
     "collect",
+    "count_collapses",
     "draw_sweep",
     "first_reaching",
     "interquartile_mean",

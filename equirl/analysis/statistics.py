@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 __all__ = [
+    "count_collapses",
     "first_reaching",
     "interquartile_mean",
     "mean_and_error",
@@ -133,3 +134,20 @@ def first_reaching(steps: Iterable[float], values: Iterable[float], level: float
     """The first of the steps at which the value is ``level`` or more; None if there is none."""
     pairs = zip(steps, values, strict=True)
     return next((step for step, value in pairs if value >= level), None)
+
+
+def count_collapses(values: Iterable[float], high: float = 0.8, low: float = 0.4) -> int:
+    """How often a curve that had ``high`` or more fell below ``low``.
+
+    Args:
+        values: Success rates of validations, in the order of their steps.
+        high: What is lost by a collapse.
+        low: What is below this is one.
+    """
+    count, up = 0, False
+    for value in values:
+        if value >= high:
+            up = True
+        elif value < low and up:
+            count, up = count + 1, False
+    return count

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from equirl.analysis.labels import task_name
 from equirl.analysis.statistics import (
+    count_collapses,
     first_reaching,
     interquartile_mean,
     mean_and_error,
@@ -26,7 +27,7 @@ SOLVED = 0.9
 #: Headings of the table for readers.
 COLUMNS = (
     *("task", "variant", "runs finished", "success", "IQM", "95 % interval"),
-    *("steps to 90 %", "return", "at step"),
+    *("steps to 90 %", "collapses", "return", "at step"),
 )
 
 
@@ -48,6 +49,7 @@ class Summary:
         reached: Runs whose validation reached 90 %.
         steps_to_90: The median over runs of the first step at which it did, a run that did not
             standing after all others; NaN when half of them or more did not.
+        collapses: How often the success of their validations fell from 80 % or more below 40 %.
         discounted_return: Of the behaviour policy, where its curve ends.
         return_error: Its standard error over runs.
         step: Where that is.
@@ -64,6 +66,7 @@ class Summary:
     high: float
     reached: int
     steps_to_90: float
+    collapses: int
     discounted_return: float
     return_error: float
     step: float
@@ -81,6 +84,7 @@ class Summary:
             f"{self.iqm:.1%}" if self.finished else "-",
             interval,
             reached,
+            str(self.collapses),
             _with_error(self.discounted_return, self.return_error),
             f"{self.step:.0f}" if self.step == self.step else "-",
         ]
@@ -121,7 +125,8 @@ def _on_task(sweep: Sweep, task: str, variant: str, window: int) -> Summary:
     curve = sweep.returns(task, variant, window)
     name = task_name(task)
     tail = (curve.mean[-1], curve.error[-1], curve.steps[-1]) if curve else (np.nan,) * 3
-    return _line(name, variant, len(tables), [sweep.test(task, variant)], reached, tail)
+    line = _line(name, variant, len(tables), [sweep.test(task, variant)], reached, tail)
+    return replace(line, collapses=sum(count_collapses(e.validation_success) for e in tables))
 
 
 def _on_all(sweep: Sweep, variant: str, own: Sequence[Summary]) -> Summary:
@@ -130,7 +135,8 @@ def _on_all(sweep: Sweep, variant: str, own: Sequence[Summary]) -> Summary:
     mean = float(np.mean([each.success for each in own]))
     error = float(np.sqrt(np.sum([each.error**2 for each in own])) / len(own))
     reached = sum(each.reached for each in own)
-    return Summary(**{**vars(line), "success": mean, "error": error, "reached": reached})
+    collapses = sum(each.collapses for each in own)
+    return replace(line, success=mean, error=error, reached=reached, collapses=collapses)
 
 
 def _line(
@@ -158,6 +164,7 @@ def _line(
         high=high,
         reached=int(np.isfinite(reached).sum()),
         steps_to_90=float(middle) if np.isfinite(middle) else np.nan,
+        collapses=0,
         discounted_return=float(tail[0]),
         return_error=float(tail[1]),
         step=float(tail[2]),

@@ -6,6 +6,7 @@ import pytest
 from equirl import analysis
 from equirl.analysis import moving_return, wilson_interval
 from equirl.analysis.statistics import (
+    count_collapses,
     first_reaching,
     interquartile_mean,
     mean_and_error,
@@ -103,6 +104,21 @@ def test_what_a_sweep_is_read_and_drawn_with_is_public():
     """And so in the reference, which is made of what the package lists."""
     names = {"read_runs", "collect", "summarise", "draw_sweep", "plot_sweep"}
     assert names | {"interquartile_mean", "stratified_interval"} <= set(analysis.__all__)
+
+
+@pytest.mark.parametrize(
+    ("values", "count"),
+    [
+        ([], 0),
+        ([0.0, 0.39, 0.79, 0.0], 0),  # never up
+        ([0.8, 0.4, 0.8], 0),
+        ([0.8, 0.6, 0.39, 0.1, 0.3], 1),
+        ([0.8, 0.1, 0.79, 0.1], 1),  # not back in between
+        ([1.0, 0.0, 1.0, 0.0, 1.0], 2),
+    ],
+)
+def test_collapses(values, count):
+    assert count_collapses(values) == count
 
 
 def test_first_reaching():

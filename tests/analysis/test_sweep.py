@@ -113,6 +113,16 @@ def test_steps_to_90_are_a_median_in_which_never_is_late(tmp_path):
     assert np.isnan(pushing.steps_to_90) and pushing.reached == 2
 
 
+def test_collapses_are_counted_over_runs_and_tasks(tmp_path):
+    write_run(tmp_path / "a", success=[0.9, 0.1, 0.9, 0.3])
+    write_run(tmp_path / "b", success=[0.9, 0.1, 0.9, 0.9], seed=1)
+    write_run(tmp_path / "c", success=[0.9, 0.5, 0.9, 0.3], env_task="block_pushing")
+    write_run(tmp_path / "d", success=[0.9, 0.5, 0.9, 0.9], env_task="block_pushing", seed=1)
+    lines = summarise(collect(read_runs(tmp_path)))
+    assert [line.collapses for line in lines] == [3, 1, 4]
+    assert [line.cells()[7] for line in lines] == ["3", "1", "4"]
+
+
 def test_errors_of_tasks_are_added_as_squares(tmp_path):
     for seed, outcome in enumerate([[1, 1], [1, 0]]):
         write_run(tmp_path / f"a{seed}", seed=seed, test=outcome)
