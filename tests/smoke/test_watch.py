@@ -134,7 +134,7 @@ def test_a_file_that_holds_no_demonstrations_is_told(watch, tmp_path, monkeypatc
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["policy=exprt"], "policy=exprt: expected expert, random, the folder of a run or a file"),
+        (["policy=exprt"], "policy=exprt: expected expert, random, the folder of a run, the file of a"),
         (["colour=red"], "colour"),
         (["env=block_stacking"], "block_stacking"),
         (["env.options.colour=red"], "BlockPicking has no option colour"),
