@@ -25,7 +25,7 @@ from torch import Tensor
 
 from equirl.modules.blocks import Block, block_filters, field_blocks
 from equirl.modules.fields import TRIVIAL, FieldType, element_key
-from equirl.modules.native.rows import Space, corner_weights, unit_filters
+from equirl.modules.native.rows import Space, corner_weights, unit_filters, without_noise
 from equirl.modules.nonlinearity import make_activation
 from equirl.symmetry import Element, SymmetryGroup
 
@@ -199,6 +199,6 @@ def _coset_channels(group: SymmetryGroup, subgroup: SymmetryGroup) -> list[int]:
 
 def _solve(units: np.ndarray, filters: np.ndarray) -> np.ndarray | None:
     """Coefficients of filters in terms of units; None if they are not in their span."""
-    coefficients = np.linalg.lstsq(units.T, filters.T, rcond=None)[0].T
+    coefficients = without_noise(np.linalg.lstsq(units.T, filters.T, rcond=None)[0].T)
     error = np.abs(coefficients @ units - filters).max()
     return coefficients if error < _TOLERANCE * np.abs(filters).max() else None
