@@ -29,18 +29,24 @@ if TYPE_CHECKING:
 @entry_point("watch", WatchJob)
 def main(job: WatchJob) -> None:
     """Plays episodes, or reads them, says how they ended and where the pictures are."""
-    from equirl.training import POLICY_SUFFIX, load_policy, make_run_env
+    from equirl.training import load_policy, make_run_env
 
     if job.policy in ("expert", "random"):
         config, policy = Config(env=job.env), None
     else:
         _check_path(job.policy)
-        if Path(job.policy).is_file() and Path(job.policy).suffix != POLICY_SUFFIX:
+        if _holds_demonstrations(Path(job.policy)):
             _watch_file(job)
             return
         config, policy = load_policy(job.policy, "auto", "auto")
     with closing(make_run_env(config)) as env:
         _watch(job, config, env, policy or _scripted(job.policy, env, job.seed))
+
+
+def _holds_demonstrations(path: Path) -> bool:
+    import h5py
+
+    return path.is_file() and (path.suffix in (".hdf5", ".h5") or h5py.is_hdf5(path))
 
 
 def _check_path(path: str) -> None:
@@ -82,7 +88,11 @@ def _watch(
 
     shown = []
     env.set_seed(job.seed)
-    with _pictures(job, config.env.task, Path(job.policy).name) as (film, sheet):
+    path = Path(job.policy)
+    with _pictures(job, config.env.task, path.stem if path.is_file() else path.name) as (
+        film,
+        sheet,
+    ):
         with open_film(film, fps=job.fps) as add:
             for number in range(1, job.episodes + 1):
                 scene = ", the scene goes on" if env.scene_continues else ""

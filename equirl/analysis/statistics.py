@@ -141,8 +141,11 @@ def count_collapses(values: Iterable[float], high: float = 0.8, low: float = 0.4
 
     Args:
         values: Success rates of validations, in the order of their steps.
-        high: What is lost by a collapse.
-        low: What is below this is one.
+        high: A curve is up from this rate on, 0 to 1.
+        low: A curve that was up and is below this has collapsed.
+
+    Returns:
+        A number; a curve has to be up again before it can collapse again.
     """
     count, up = 0, False
     for value in values:

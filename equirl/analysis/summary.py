@@ -125,18 +125,18 @@ def _on_task(sweep: Sweep, task: str, variant: str, window: int) -> Summary:
     curve = sweep.returns(task, variant, window)
     name = task_name(task)
     tail = (curve.mean[-1], curve.error[-1], curve.steps[-1]) if curve else (np.nan,) * 3
-    line = _line(name, variant, len(tables), [sweep.test(task, variant)], reached, tail)
-    return replace(line, collapses=sum(count_collapses(e.validation_success) for e in tables))
+    collapses = sum(count_collapses(each.validation_success) for each in tables)
+    return _line(name, variant, len(tables), [sweep.test(task, variant)], reached, collapses, tail)
 
 
 def _on_all(sweep: Sweep, variant: str, own: Sequence[Summary]) -> Summary:
     strata = [sweep.test(task, variant) for task in sweep.tasks]
-    line = _line(ALL_TASKS, variant, sum(each.runs for each in own), strata, [], (np.nan,) * 3)
+    runs, collapses = sum(each.runs for each in own), sum(each.collapses for each in own)
+    line = _line(ALL_TASKS, variant, runs, strata, [], collapses, (np.nan,) * 3)
     mean = float(np.mean([each.success for each in own]))
     error = float(np.sqrt(np.sum([each.error**2 for each in own])) / len(own))
     reached = sum(each.reached for each in own)
-    collapses = sum(each.collapses for each in own)
-    return replace(line, success=mean, error=error, reached=reached, collapses=collapses)
+    return replace(line, success=mean, error=error, reached=reached)
 
 
 def _line(
@@ -145,6 +145,7 @@ def _line(
     runs: int,
     strata: Sequence[Sequence[float]],
     reached: Sequence[float],
+    collapses: int,
     tail: Sequence[float],
 ) -> Summary:
     values = [value for stratum in strata for value in stratum]
@@ -164,7 +165,7 @@ def _line(
         high=high,
         reached=int(np.isfinite(reached).sum()),
         steps_to_90=float(middle) if np.isfinite(middle) else np.nan,
-        collapses=0,
+        collapses=collapses,
         discounted_return=float(tail[0]),
         return_error=float(tail[1]),
         step=float(tail[2]),

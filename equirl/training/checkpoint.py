@@ -15,7 +15,14 @@ import torch
 
 from equirl.config import is_free
 
-__all__ = ["CheckpointError", "check_same_config", "load_checkpoint", "save_checkpoint"]
+__all__ = [
+    "CheckpointError",
+    "check_same_config",
+    "load_checkpoint",
+    "read_state",
+    "save_checkpoint",
+    "write_state",
+]
 
 _FORMAT = 5
 
@@ -31,16 +38,26 @@ def save_checkpoint(state: dict[str, Any], path: Path) -> None:
         CheckpointError: The disk is full or the folder cannot be written; the previous
             checkpoint is untouched.
     """
+    write_state({"format": _FORMAT, **state}, path)
+
+
+def write_state(state: dict[str, Any], path: Path) -> None:
+    """Writes tensors and plain values, as `save_checkpoint` does, without its format.
+
+    Raises:
+        CheckpointError: The disk is full or the folder cannot be written; what was there before
+            is untouched.
+    """
     partial = path.with_suffix(".partial")
     try:
         with open(partial, "wb") as file:
-            torch.save({"format": _FORMAT, **state}, file)
+            torch.save(state, file)
             file.flush()
             os.fsync(file.fileno())
         os.replace(partial, path)
     except (OSError, RuntimeError) as error:
         partial.unlink(missing_ok=True)
-        kept = "the previous checkpoint is kept" if path.exists() else "there is none yet"
+        kept = "what was there is kept" if path.exists() else "there is none yet"
         full = "" if isinstance(error, OSError) else " (is the disk full?)"  # torch's own words
         raise CheckpointError(f"cannot write {path}: {error}{full}; {kept}") from error
 
@@ -51,19 +68,32 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     Raises:
         CheckpointError: The file is missing, damaged, or of another format.
     """
+    state = read_state(path)
+    if state.get("format") != _FORMAT:
+        found = state.get("format", "none")
+        raise CheckpointError(f"{path} is not a checkpoint of format {_FORMAT}; it has {found!r}")
+    return state
+
+
+def read_state(path: Path) -> dict[str, Any]:
+    """Reads what `write_state` wrote onto the CPU, without executing code from it.
+
+    Raises:
+        CheckpointError: The file is missing or damaged, or holds no dictionary.
+    """
     try:
         with zipfile.ZipFile(path) as archive:
             damaged = archive.testzip()  # checks sums that torch does not
         if damaged:
             raise zipfile.BadZipFile(f"its part {damaged} is damaged")
         state = torch.load(path, map_location="cpu", weights_only=True)
+        if not isinstance(state, dict):
+            raise TypeError(f"it holds a {type(state).__name__}, expected a dictionary")
     except FileNotFoundError:
         raise CheckpointError(f"no checkpoint at {path}") from None
     except Exception as error:  # torch raises many kinds for a damaged file
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise CheckpointError(f"{path} is not a readable checkpoint: {reason}") from error
-    if not isinstance(state, dict) or state.get("format") != _FORMAT:
-        raise CheckpointError(f"{path} is not a checkpoint of format {_FORMAT}")
     return state
 
 

@@ -123,18 +123,28 @@ def test_a_file_of_demonstrations(watch, tmp_path, monkeypatch):
         assert np.corrcoef(brightness.ravel(), -depth.numpy().ravel())[0, 1] > 0.9
 
 
-def test_a_file_that_holds_no_demonstrations_is_told(watch, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("notes.hdf5", "error: policy={}: not an HDF5 file"),
+        (
+            "notes.txt",
+            "error: {} is not a readable checkpoint: File is not a zip file; expected the",
+        ),
+    ],
+)
+def test_a_file_that_holds_nothing_to_watch_is_told(watch, tmp_path, monkeypatch, name, told):
     monkeypatch.setattr(sys.modules[__name__], "SMALL", [])
-    (tmp_path / "notes.txt").write_text("not a dataset")
-    complaint = watch(f"policy={tmp_path / 'notes.txt'}")
-    assert f"error: policy={tmp_path / 'notes.txt'}: not an HDF5 file" in complaint
+    (tmp_path / name).write_text("neither demonstrations nor a policy")
+    complaint = watch(f"policy={tmp_path / name}")
+    assert told.format(tmp_path / name) in complaint
     assert "Traceback" not in complaint
 
 
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["policy=exprt"], "policy=exprt: expected expert, random, the folder of a run, the file of a"),
+        (["policy=exprt"], "policy=exprt: expected expert, random, the folder of a run, the file"),
         (["colour=red"], "colour"),
         (["env=block_stacking"], "block_stacking"),
         (["env.options.colour=red"], "BlockPicking has no option colour"),

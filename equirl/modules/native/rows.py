@@ -19,7 +19,7 @@ _Term = tuple[str, int, int]
 _Row = list[list[_Term]]
 
 _TOLERANCE = 1e-9
-_DECIMALS = 12
+_DECIMALS = 11
 
 
 class Space(Enum):
@@ -125,10 +125,10 @@ def corner_weights(filters: np.ndarray) -> tuple[float, float] | None:
 
 
 def without_noise(solution: np.ndarray) -> np.ndarray:
-    """What was solved for in float64, without the errors of rounding.
+    """What was solved for in float64, of any shape, rounded to 11 decimals.
 
-    They are about 1e-17 where the solution is zero, and others on another number of processors.
-    Training amplifies them until two runs of one seed part.
+    Its errors, up to 1e-14 and with them what should be zero, differ with the number of threads
+    of the linear algebra. Training amplifies them until two runs of one seed part.
     """
     return np.round(solution, _DECIMALS) + 0.0  # no negative zeros
 
