@@ -48,7 +48,7 @@ def write_state(state: dict[str, Any], path: Path) -> None:
         CheckpointError: The disk is full or the folder cannot be written; what was there before
             is untouched.
     """
-    partial = path.with_suffix(".partial")
+    partial = path.with_name(f"{path.name}.partial")
     try:
         with open(partial, "wb") as file:
             torch.save(state, file)
@@ -57,7 +57,7 @@ def write_state(state: dict[str, Any], path: Path) -> None:
         os.replace(partial, path)
     except (OSError, RuntimeError) as error:
         partial.unlink(missing_ok=True)
-        kept = "what was there is kept" if path.exists() else "there is none yet"
+        kept = "the previous file is kept" if path.exists() else "there is none yet"
         full = "" if isinstance(error, OSError) else " (is the disk full?)"  # torch's own words
         raise CheckpointError(f"cannot write {path}: {error}{full}; {kept}") from error
 

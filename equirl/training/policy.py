@@ -27,8 +27,8 @@ def save_policy(folder: str | Path, path: str | Path) -> None:
     """Writes the trained policy of a run to a file for `load_policy`.
 
     It holds the policy's parameters and the run's configuration, 0.3 MB for the laptop preset:
-    neither critic nor optimiser nor replay buffer, so that no run can go on from it. Absolute
-    paths in the configuration are shortened unless the run has ``logging.private=false``.
+    neither critic nor optimiser nor replay buffer, so that no run can go on from it. The path of
+    the demonstrations is shortened unless the run has ``logging.private=false``.
 
     Args:
         folder: The run's folder.
@@ -51,7 +51,9 @@ def save_policy(folder: str | Path, path: str | Path) -> None:
     except OSError as error:
         raise CheckpointError(f"cannot write {path}: {error}") from None
     config = load_run_config(Path(folder))
-    run = private_value(asdict(config)) if config.logging.private else asdict(config)
+    run = asdict(config)
+    if config.logging.private:
+        run["demos"] = private_value(run["demos"])
     write_state({"format": _FORMAT, "run": run, "step": state["step"], "policy": policy}, path)
 
 

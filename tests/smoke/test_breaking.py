@@ -135,7 +135,7 @@ def test_a_checkpoint_that_cannot_be_written(here, whole, tmp_path):
     code, _, err = call(
         "train.py", f"resume={folder}", "steps=150", preexec_fn=limited(len(checkpoint) // 2)
     )
-    assert code == 1 and "the previous checkpoint is kept" in sentence(err)
+    assert code == 1 and "the previous file is kept" in sentence(err)
     assert (folder / "checkpoint.pt").read_bytes() == checkpoint
     assert not list(folder.glob("*.partial"))
     code, _, err = here("train.py", f"resume={folder}", "steps=150")
